@@ -1,0 +1,248 @@
+"""The rig: tablet, camera and mirror ball above a flat sample, and all of its geometry.
+
+Right-handed metres, origin at the sample's centre, z up, x towards the camera and the ball.
+The sample fills x, y in [-l/4, l/4]; the l × l screen hangs at height h, shifted to the sample's
+mirror image as the camera sees it; the camera sits at (l/4 + delta, 0, h) and looks straight down
+on the ball, which stands at (l/4 + delta, 0, 0). Nothing else in the package repeats these numbers.
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from invrender.errors import InputError
+
+Array = NDArray[np.floating[Any]]
+Vec3 = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Sizes in metres, angles in degrees. The defaults are a tablet and a 19 mm ball.
+
+    ``screen_shift`` and ``screen_tilt`` (a rotation vector about the screen's centre), and the
+    same for the camera, say how a hand-held rig differs from the nominal one.
+    """
+
+    screen_size: float = 0.18
+    screen_height: float = 0.153
+    camera_offset: float = 0.017
+    ball_radius: float = 0.0095
+    fov: float = 73.7
+    ball_reflectance: Vec3 = (0.9, 0.9, 0.9)
+    screen_shift: Vec3 = (0.0, 0.0, 0.0)
+    screen_tilt: Vec3 = (0.0, 0.0, 0.0)
+    camera_shift: Vec3 = (0.0, 0.0, 0.0)
+    camera_tilt: Vec3 = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            if not np.all(np.isfinite(getattr(self, f.name))):
+                raise InputError(f"rig: {f.name} must be finite")
+        for name in ("screen_size", "ball_radius"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"rig: {name} must be positive, got {getattr(self, name):g}")
+        if not self.screen_height > 0:
+            raise InputError(
+                f"rig: the screen must be above the table, got a height of {self.screen_height:g}"
+            )
+        if not self.camera_offset >= 0:
+            raise InputError(f"rig: camera offset must not be negative, got {self.camera_offset:g}")
+        if not 1 <= self.fov <= 170:
+            raise InputError(f"rig: fov must be between 1 and 170 degrees, got {self.fov:g}")
+        if not all(0 < r <= 1 for r in self.ball_reflectance):
+            raise InputError("rig: ball reflectance must be above 0 and at most 1")
+        if self.screen_corner[2] <= 0 or any(
+            c[2] <= 0 for c in (self.screen_corner + a + b for a in (0, self.screen_edges[0])
+                                for b in (0, self.screen_edges[1]))
+        ):
+            raise InputError("rig: the tilted screen reaches below the table")
+
+    # --- the sample -----------------------------------------------------------------------------
+
+    @property
+    def sample_size(self) -> float:
+        """Side of the square sample, l/2."""
+        return self.screen_size / 2
+
+    def sample_points(self, height: int, width: int) -> Array:
+        """Centres of an H × W grid of sample pixels, (H, W, 3), row 0 at +y."""
+        half = self.sample_size / 2
+        x = ((np.arange(width) + 0.5) / width * 2 - 1) * half
+        y = (1 - (np.arange(height) + 0.5) / height * 2) * half
+        points = np.zeros((height, width, 3))
+        points[..., 0], points[..., 1] = x[None, :], y[:, None]
+        return points
+
+    # --- the screen -----------------------------------------------------------------------------
+
+    @property
+    def screen_edges(self) -> tuple[Array, Array]:
+        """The screen's sides as vectors, along +x and along +y where it is not tilted."""
+        turn = Rotation.from_rotvec(self.screen_tilt, degrees=True)
+        return (
+            turn.apply([self.screen_size, 0.0, 0.0]),
+            turn.apply([0.0, self.screen_size, 0.0]),
+        )
+
+    @property
+    def screen_corner(self) -> Array:
+        """The screen's corner at -x, -y: point (s, t) of the screen is corner + s·e_x + t·e_y."""
+        centre = np.array(
+            [-self.screen_size / 4 - self.camera_offset, 0.0, self.screen_height]
+        ) + np.asarray(self.screen_shift)
+        e_x, e_y = self.screen_edges
+        return centre - e_x / 2 - e_y / 2
+
+    # --- the camera -----------------------------------------------------------------------------
+
+    @property
+    def optical_axis_x(self) -> float:
+        """x of the ball and of the nominal camera, l/4 + delta."""
+        return self.screen_size / 4 + self.camera_offset
+
+    @property
+    def camera(self) -> Array:
+        """Position of the pinhole, (3,)."""
+        nominal = np.array([self.optical_axis_x, 0.0, self.screen_height])
+        return nominal + np.asarray(self.camera_shift)
+
+    @property
+    def camera_axes(self) -> Array:
+        """Rows: the directions of the photo's right, its up, and towards the viewer (3, 3)."""
+        return Rotation.from_rotvec(self.camera_tilt, degrees=True).as_matrix().T
+
+    @property
+    def ball_centre(self) -> Array:
+        """Centre of the mirror (hemi)sphere, on the table below the nominal camera."""
+        return np.array([self.optical_axis_x, 0.0, 0.0])
+
+    def focal(self, photo_width: int) -> float:
+        """Focal length in pixels of a photo that wide."""
+        return photo_width / 2 / math.tan(math.radians(self.fov) / 2)
+
+    def project(self, points: Array, height: int, width: int) -> Array:
+        """World points (..., 3) to photo pixels (..., 2): x right, y down, (0, 0) a corner.
+
+        Pixel i of a row covers [i, i + 1]. Points behind the camera give NaN.
+        """
+        p = (np.asarray(points) - self.camera) @ self.camera_axes.T
+        depth = np.where(p[..., 2] < 0, -p[..., 2], np.nan)
+        f = self.focal(width)
+        return np.stack(
+            [width / 2 + f * p[..., 0] / depth, height / 2 - f * p[..., 1] / depth], -1
+        )
+
+    def rays(self, pixels: Array, height: int, width: int) -> Array:
+        """Unit directions (..., 3) from the camera through photo pixels (..., 2)."""
+        pixels = np.asarray(pixels)
+        f = self.focal(width)
+        d = np.stack(
+            [
+                (pixels[..., 0] - width / 2) / f,
+                (height / 2 - pixels[..., 1]) / f,
+                -np.ones(pixels.shape[:-1]),
+            ],
+            -1,
+        )
+        d = d @ self.camera_axes
+        return d / np.linalg.norm(d, axis=-1, keepdims=True)
+
+
+# Section and key of rig.toml for each field of Rig.
+_KEYS: dict[tuple[str, str], str] = {
+    ("screen", "size"): "screen_size",
+    ("screen", "height"): "screen_height",
+    ("screen", "shift"): "screen_shift",
+    ("screen", "tilt"): "screen_tilt",
+    ("camera", "offset"): "camera_offset",
+    ("camera", "fov"): "fov",
+    ("camera", "shift"): "camera_shift",
+    ("camera", "tilt"): "camera_tilt",
+    ("ball", "radius"): "ball_radius",
+    ("ball", "reflectance"): "ball_reflectance",
+}
+_FILES = {("pattern", "image"), ("sample", "maps")}
+_REQUIRED = [("screen", "size"), ("screen", "height"), ("camera", "offset"), ("ball", "radius")]
+_VECTORS = {f.name for f in fields(Rig) if f.type == "Vec3"}
+
+
+def read_rig(path: Path) -> tuple[Rig, dict[str, str]]:
+    """Read ``rig.toml``.
+
+    Returns the rig and the file names it gives: ``{"pattern": ..., "sample": ...}``, where present.
+    Raises `InputError` for a missing file, bad TOML, unknown or missing keys, wrong types or sizes.
+    """
+    try:
+        with open(path, "rb") as f:
+            table = tomllib.load(f)
+    except OSError:
+        raise InputError(f"{path} is missing or unreadable; a capture folder needs it") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as e:
+        raise InputError(f"{path} is not valid TOML: {e}") from None
+
+    values: dict[str, Any] = {}
+    files: dict[str, str] = {}
+    for section, entries in table.items():
+        if not isinstance(entries, dict):
+            raise InputError(f"{path}: '{section}' must be a [section]")
+        for key, value in entries.items():
+            if (section, key) in _FILES:
+                if not isinstance(value, str) or not value:
+                    raise InputError(f"{path}: [{section}] {key} must be a file name")
+                files[section] = value
+            elif (section, key) in _KEYS:
+                name = _KEYS[section, key]
+                values[name] = _number(path, f"[{section}] {key}", value, name in _VECTORS)
+            else:
+                known = sorted({k for s, k in [*_KEYS, *_FILES] if s == section})
+                hint = f"known keys: {', '.join(known)}" if known else "no such section"
+                raise InputError(f"{path}: unknown key '{key}' in [{section}] ({hint})")
+    for section, key in _REQUIRED:
+        if _KEYS[section, key] not in values:
+            raise InputError(f"{path}: [{section}] {key} is missing")
+    return Rig(**values), files
+
+
+def _number(path: Path, what: str, value: Any, vector: bool) -> float | Vec3:
+    def real(v: Any) -> bool:
+        return isinstance(v, (int, float)) and not isinstance(v, bool)
+
+    if vector:
+        if real(value):
+            return (float(value),) * 3
+        if isinstance(value, list) and len(value) == 3 and all(map(real, value)):
+            return (float(value[0]), float(value[1]), float(value[2]))
+        raise InputError(f"{path}: {what} must be a number or a list of three")
+    if not real(value):
+        raise InputError(f"{path}: {what} must be a number")
+    return float(value)
+
+
+def write_rig(path: Path, rig: Rig, pattern: str = "", sample: str = "") -> None:
+    """Write ``rig.toml``; fields at their default are left out, except the four required ones."""
+    default = Rig()
+    lines: list[str] = []
+    section_now = ""
+    entries: list[tuple[str, str, str]] = []
+    for (section, key), name in _KEYS.items():
+        value = getattr(rig, name)
+        if (section, key) in _REQUIRED or value != getattr(default, name) or name == "fov":
+            text = str(list(value)) if isinstance(value, tuple) else repr(float(value))
+            entries.append((section, key, text))
+    entries += [("pattern", "image", f'"{pattern}"')] if pattern else []
+    entries += [("sample", "maps", f'"{sample}"')] if sample else []
+    for section, key, text in entries:
+        if section != section_now:
+            lines.append(f"[{section}]")
+            section_now = section
+        lines.append(f"{key} = {text}")
+    path.write_text("\n".join(lines) + "\n")
