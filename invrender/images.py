@@ -2,22 +2,64 @@
 
 from __future__ import annotations
 
+import math
 import os
+import struct
 import tempfile
+import warnings
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import OpenEXR
+import tifffile
+from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 from PIL import Image
 
 from invrender.errors import InputError
 
 Array = NDArray[np.floating[Any]]
-MAX_PIXELS = 200_000_000
+MAX_PIXELS = 100_000_000
+_ORIENTATION, _EXIF_IFD = 0x0112, 0x8769
+_EXPOSURE_TIME, _F_NUMBER, _ISO, _FOCAL_35MM = 0x829A, 0x829D, 0x8827, 0xA405
+# Offset and step (x0, y0, dx, dy) of the seven passes of an interlaced PNG.
+_ADAM7 = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2),
+          (0, 1, 1, 2))  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Photo:
+    """A photograph, upright: ``image`` (H, W, 3) linear RGB float32, not negative.
+
+    ``clip_level`` is the value at which a channel is saturated, None for HDR files. ``fov`` is the
+    horizontal field of view in degrees and ``exposure`` the relative exposure t·ISO/(100·N²), in
+    seconds, both None where the file does not say.
+    """
+
+    image: Array
+    clip_level: float | None = None
+    fov: float | None = None
+    exposure: float | None = None
+
+    @property
+    def height(self) -> int:
+        return int(self.image.shape[0])
+
+    @property
+    def width(self) -> int:
+        return int(self.image.shape[1])
+
+    @property
+    def clipped(self) -> NDArray[np.bool_]:
+        """(H, W): pixels where at least one channel is saturated."""
+        if self.clip_level is None:
+            return np.zeros(self.image.shape[:2], bool)
+        return np.asarray((self.image >= self.clip_level).any(-1))
 
 
 def srgb_to_linear(x: Array) -> Array:
@@ -35,59 +77,255 @@ def linear_to_srgb(x: Array) -> Array:
 def read_image(path: Path, *, linear: bool = False) -> Array:
     """Read an EXR, PNG, TIFF or JPEG as (H, W, 3) float32 linear RGB.
 
-    Integer files are decoded from sRGB unless ``linear`` is set (roughness, normals). Grey becomes
-    three equal channels, alpha is dropped. Raises `InputError` for anything that is not such a
-    file, is larger than `MAX_PIXELS`, or holds NaN or infinity.
+    Integer files (8 or 16 bits) are decoded from sRGB unless ``linear`` is set (roughness,
+    normals); float files are linear. Grey becomes three equal channels, alpha is dropped, the EXIF
+    orientation is applied. Raises `InputError` for anything that is not such a file, is larger
+    than `MAX_PIXELS`, or holds NaN or infinity.
     """
-    path = Path(path)
+    return _read(Path(path), linear).image
+
+
+def read_photo(path: Path) -> Photo:
+    """Read a photograph as `read_image` does, with what its EXIF says about lens and exposure.
+
+    The field of view comes from the 35 mm equivalent focal length, by CIPA DCG-001 a ratio of
+    diagonals: tan(fov/2) = (43.27 mm / 2f) · width/diagonal.
+    """
+    photo = _read(Path(path), False)
+    return Photo(np.maximum(photo.image, 0), photo.clip_level, photo.fov, photo.exposure)
+
+
+def _read(path: Path, linear: bool) -> Photo:
     if not path.is_file():
         raise InputError(f"{path} does not exist")
-    image = _read_exr(path) if path.suffix.lower() == ".exr" else _read_integer(path, linear)
-    if not np.all(np.isfinite(image)):
+    try:
+        with open(path, "rb") as f:
+            head = f.read(32)
+    except OSError:
+        raise InputError(f"{path} cannot be read") from None
+    if path.suffix.lower() == ".exr":
+        photo = Photo(_read_exr(path))
+    else:
+        exif = None
+        if head[:4] in (b"II*\0", b"MM\0*"):
+            data, orientation = _read_tiff(path)
+        else:
+            data, orientation, exif = _read_pillow(path, head)
+        data = _upright(data, orientation)
+        clip = None
+        if data.dtype != np.float32:
+            levels = 256 if data.dtype == np.uint8 else 65536
+            table = (np.arange(levels) / (levels - 1)).astype(np.float32)
+            data = (table if linear else srgb_to_linear(table))[data]
+            # JPEG rings around a saturated area: its pixels lie a little below white.
+            clip = float(srgb_to_linear(np.array(250 / 255)))
+        image = np.asarray(data, np.float32)
+        fov, exposure = _lens(exif, *image.shape[:2])
+        photo = Photo(image, clip, fov, exposure)
+    if not np.all(np.isfinite(photo.image)):
         raise InputError(f"{path} contains NaN or infinite pixels")
-    return image
+    return photo
+
+
+def _check_size(path: Path, width: int, height: int) -> None:
+    if width < 1 or height < 1:
+        raise InputError(f"{path} has no pixels")
+    if width * height > MAX_PIXELS:
+        raise InputError(
+            f"{path} has {width} × {height} pixels, more than the {MAX_PIXELS:,} this program reads"
+        )
 
 
 def _read_exr(path: Path) -> Array:
     try:
-        with OpenEXR.File(str(path), separate_channels=True) as f:
+        with OpenEXR.File(str(path), header_only=True) as f:
             window = f.header()["dataWindow"]
-            w, h = (int(window[1][i]) - int(window[0][i]) + 1 for i in (0, 1))
-            if w * h > MAX_PIXELS:
-                raise InputError(f"{path} has {w} × {h} pixels, more than this program reads")
+            _check_size(path, *(int(window[1][i]) - int(window[0][i]) + 1 for i in (0, 1)))
+        with OpenEXR.File(str(path), separate_channels=True) as f:
             channels = {k: v.pixels for k, v in f.channels().items()}
     except InputError:
         raise
     except Exception:  # the binding raises bare RuntimeError, TypeError and KeyError
         raise InputError(f"{path} is not a readable OpenEXR file") from None
-    try:
-        planes = [channels[c] for c in "RGB"]
-    except KeyError:
-        if not channels:
-            raise InputError(f"{path} has no image channels") from None
-        grey = channels.get("Y", next(iter(channels.values())))
-        planes = [grey] * 3
+    colour = {k.rpartition(".")[2]: v for k, v in reversed(channels.items())} | channels
+    if all(c in colour for c in "RGB"):
+        planes = [colour[c] for c in "RGB"]
+    elif "Y" in colour or len(channels) == 1:
+        planes = [colour.get("Y", next(iter(channels.values())))] * 3
+    else:
+        names = ", ".join(channels) or "none"
+        raise InputError(f"{path} has neither R, G, B nor Y channels (it has {names})")
     if any(p.shape != planes[0].shape for p in planes):
         raise InputError(f"{path} has subsampled channels; save it as plain RGB")
     return np.stack(planes, -1).astype(np.float32)
 
 
-def _read_integer(path: Path, linear: bool) -> Array:
+def _rgb(data: NDArray[Any]) -> NDArray[Any]:
+    """(H, W) or (H, W, 1..4) to (H, W, 3): grey repeated, alpha dropped."""
+    data = data[..., None] if data.ndim == 2 else data
+    return data[..., :3] if data.shape[-1] >= 3 else np.repeat(data[..., :1], 3, -1)
+
+
+def _read_pillow(path: Path, head: bytes) -> tuple[NDArray[Any], int, Image.Exif]:
     try:
-        with Image.open(path) as im:
-            if im.width * im.height > MAX_PIXELS:
-                raise InputError(f"{path} has {im.width} × {im.height} pixels, too many to read")
-            im.load()
-            if im.mode in ("I;16", "I;16B", "I;16L", "I"):
-                grey = np.asarray(im, dtype=np.float32) / 65535
-                data = np.repeat(grey[..., None], 3, -1)
-            else:
-                data = np.asarray(im.convert("RGB"), dtype=np.float32) / 255
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(path) as im:
+                _check_size(path, im.width, im.height)
+                exif = im.getexif()
+                if head[:8] == b"\x89PNG\r\n\x1a\n" and head[24] == 16:
+                    data = _read_png16(path)
+                else:
+                    im.load()
+                    wide = im.mode.startswith("I")
+                    data = np.asarray(im if wide else im.convert("RGB"))
+                    data = _rgb(data.astype(np.uint16) if wide else data)
+            return data, int(exif.get(_ORIENTATION, 1) or 1), exif
     except InputError:
         raise
+    except Image.DecompressionBombError:
+        raise InputError(
+            f"{path} has more than the {MAX_PIXELS:,} pixels this program reads"
+        ) from None
     except Exception:  # Pillow's decoders raise many kinds
-        raise InputError(f"{path} is not a readable image") from None
-    return data.astype(np.float32) if linear else srgb_to_linear(data)
+        raise InputError(
+            f"{path} is not a readable image (EXR, TIFF, PNG or JPEG, complete)"
+        ) from None
+
+
+def _read_tiff(path: Path) -> tuple[NDArray[Any], int]:
+    try:
+        with tifffile.TiffFile(path) as f:
+            page = f.pages[0]
+            assert isinstance(page, tifffile.TiffPage)
+            _check_size(path, page.imagewidth, page.imagelength)
+            tag = page.tags.get(_ORIENTATION)
+            orientation = int(tag.value) if tag else 1
+            if page.photometric == tifffile.PHOTOMETRIC.PALETTE or page.compression not in (
+                1, 5, 8, 32773, 32946
+            ):  # fmt: skip
+                with Image.open(path) as im:
+                    return np.asarray(im.convert("RGB")), orientation
+            data = page.asarray()
+            if page.planarconfig == 2 and data.ndim == 3:
+                data = np.moveaxis(data, 0, -1)
+            if page.photometric == tifffile.PHOTOMETRIC.MINISWHITE:
+                data = data.max() - data if data.dtype == bool else np.invert(data)
+    except InputError:
+        raise
+    except Exception:  # damaged files raise many kinds
+        raise InputError(f"{path} is not a readable TIFF image") from None
+    if data.dtype == bool:
+        data = data.astype(np.uint8) * 255
+    if data.dtype in (np.float16, np.float64):
+        data = data.astype(np.float32)
+    if data.dtype not in (np.uint8, np.uint16, np.float32) or data.ndim not in (2, 3):
+        raise InputError(f"{path} is a TIFF of {data.dtype}; save it as 8 or 16 bits or as float")
+    return _rgb(data), orientation
+
+
+def _read_png16(path: Path) -> NDArray[np.uint16]:
+    """Decode a 16-bit PNG (Pillow reduces the colour ones to 8 bits). W3C PNG 3rd ed., 7 to 9."""
+    blob = path.read_bytes()
+    width, height, _, kind, _, _, interlace = struct.unpack(">IIBBBBB", blob[16:29])
+    channels = {0: 1, 2: 3, 4: 2, 6: 4}[kind]
+    parts, at = [], 8
+    while at + 8 <= len(blob):
+        (length,) = struct.unpack(">I", blob[at : at + 4])
+        if blob[at + 4 : at + 8] == b"IDAT":
+            parts.append(blob[at + 8 : at + 8 + length])
+        at += 12 + length
+    passes = _ADAM7 if interlace else ((0, 0, 1, 1),)
+    sizes = [(-(-(height - y) // dy), -(-(width - x) // dx)) for x, y, dx, dy in passes]
+    step = 2 * channels
+    total = sum(h * (w * step + 1) for h, w in sizes if h > 0 and w > 0)
+    raw = np.frombuffer(zlib.decompressobj().decompress(b"".join(parts), total), np.uint8)
+    if raw.size < total:
+        raise ValueError("truncated")
+    image = np.zeros((height, width, channels), np.uint16)
+    start = 0
+    for (x, y, dx, dy), (h, w) in zip(passes, sizes, strict=True):
+        if h > 0 and w > 0:
+            size = h * (w * step + 1)
+            rows = raw[start : start + size].reshape(h, w * step + 1)
+            data = _unfilter(rows[:, 1:], rows[:, 0], step)
+            image[y::dy, x::dx] = data.view(">u2").reshape(h, w, channels)
+            start += size
+    return _rgb(image)  # type: ignore[no-any-return]
+
+
+def _unfilter(rows: NDArray[np.uint8], kinds: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
+    """Undo PNG's row filters, one anti-diagonal of pixels at a time: each needs only the two
+    diagonals before it, and all of one diagonal can be done at once."""
+    h, stride = rows.shape[0], rows.shape[1] + step
+    if kinds.max() > 4:
+        raise ValueError("unknown filter")
+    if not kinds.any():
+        return np.ascontiguousarray(rows)
+    out = np.zeros((h + 1, stride), np.uint8)  # with a row and a pixel of zeros before the image
+    out[1:, step:] = rows
+    flat = out.reshape(-1)
+    width = rows.shape[1] // step
+    chosen = [(kinds == k)[:, None] for k in range(5)]
+    for d in range(h + width - 1):
+        first, last = max(0, d - width + 1), min(h - 1, d)
+        n = last - first + 1
+
+        def view(row: int, column: int, n: int = n) -> NDArray[np.uint8]:
+            return as_strided(flat[row * stride + column * step :], (n, step), (stride - step, 1))
+
+        here = view(first + 1, d - first + 1)
+        left, up = view(first + 1, d - first), view(first, d - first + 1)
+        a, b = left.astype(np.int16), up.astype(np.int16)
+        c = view(first, d - first).astype(np.int16)
+        pa, pb, pc = np.abs(b - c), np.abs(a - c), np.abs(a + b - 2 * c)
+        paeth = np.where((pa <= pb) & (pa <= pc), a, np.where(pb <= pc, b, c))
+        is_ = [m[first : last + 1] for m in chosen]
+        add = np.where(is_[1], a, 0) + np.where(is_[2], b, 0)
+        add = add + np.where(is_[3], (a + b) >> 1, 0) + np.where(is_[4], paeth, 0)
+        here += add.astype(np.uint8)
+    return np.ascontiguousarray(out[1:, step:])
+
+
+def _upright(data: NDArray[Any], orientation: int) -> NDArray[Any]:
+    """Apply the EXIF orientation 1 to 8; unknown values leave the image alone."""
+    if orientation in (5, 6, 7, 8):
+        data = data.swapaxes(0, 1)
+    if orientation in (2, 3, 6, 7):
+        data = data[:, ::-1]
+    if orientation in (3, 4, 7, 8):
+        data = data[::-1]
+    return data
+
+
+def _lens(exif: Image.Exif | None, height: int, width: int) -> tuple[float | None, float | None]:
+    """Field of view in degrees and relative exposure in seconds, None where EXIF is silent."""
+    if exif is None:
+        return None, None
+    try:
+        tags = exif.get_ifd(_EXIF_IFD)
+    except Exception:  # damaged EXIF must not cost the photo
+        return None, None
+
+    def positive(tag: int) -> float | None:
+        value = tags.get(tag)
+        value = value[0] if isinstance(value, tuple) and value else value
+        try:
+            number = float(value)  # type: ignore[arg-type]
+        except (TypeError, ValueError, ZeroDivisionError):
+            return None
+        return number if math.isfinite(number) and number > 0 else None
+
+    focal, time = positive(_FOCAL_35MM), positive(_EXPOSURE_TIME)
+    f_number, iso = positive(_F_NUMBER), positive(_ISO)
+    fov = exposure = None
+    if focal:
+        tangent = math.hypot(36, 24) / 2 / focal * width / math.hypot(width, height)
+        fov = math.degrees(2 * math.atan(tangent))
+        fov = fov if 1 <= fov <= 170 else None
+    if time and f_number and iso:
+        exposure = time * iso / 100 / f_number**2
+    return fov, exposure
 
 
 @contextmanager

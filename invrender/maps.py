@@ -55,7 +55,11 @@ class Maps:
 
 
 def constant_maps(
-    height: int, width: int, diffuse: Any = 0.5, specular: Any = 0.04, roughness: float = 0.5,
+    height: int,
+    width: int,
+    diffuse: Any = 0.5,
+    specular: Any = 0.04,
+    roughness: float = 0.5,
     normal: Any = (0.0, 0.0, 1.0),
 ) -> Maps:
     """Maps of one material all over."""

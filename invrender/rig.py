@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import tomllib
 from dataclasses import dataclass, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -61,8 +62,12 @@ class Rig:
         if not all(0 < r <= 1 for r in self.ball_reflectance):
             raise InputError("rig: ball reflectance must be above 0 and at most 1")
         if self.screen_corner[2] <= 0 or any(
-            c[2] <= 0 for c in (self.screen_corner + a + b for a in (0, self.screen_edges[0])
-                                for b in (0, self.screen_edges[1]))
+            c[2] <= 0
+            for c in (
+                self.screen_corner + a + b
+                for a in (0, self.screen_edges[0])
+                for b in (0, self.screen_edges[1])
+            )
         ):
             raise InputError("rig: the tilted screen reaches below the table")
 
@@ -115,7 +120,7 @@ class Rig:
         nominal = np.array([self.optical_axis_x, 0.0, self.screen_height])
         return nominal + np.asarray(self.camera_shift)
 
-    @property
+    @cached_property
     def camera_axes(self) -> Array:
         """Rows: the directions of the photo's right, its up, and towards the viewer (3, 3)."""
         return Rotation.from_rotvec(self.camera_tilt, degrees=True).as_matrix().T
@@ -137,9 +142,7 @@ class Rig:
         p = (np.asarray(points) - self.camera) @ self.camera_axes.T
         depth = np.where(p[..., 2] < 0, -p[..., 2], np.nan)
         f = self.focal(width)
-        return np.stack(
-            [width / 2 + f * p[..., 0] / depth, height / 2 - f * p[..., 1] / depth], -1
-        )
+        return np.stack([width / 2 + f * p[..., 0] / depth, height / 2 - f * p[..., 1] / depth], -1)
 
     def rays(self, pixels: Array, height: int, width: int) -> Array:
         """Unit directions (..., 3) from the camera through photo pixels (..., 2)."""
@@ -175,8 +178,8 @@ _REQUIRED = [("screen", "size"), ("screen", "height"), ("camera", "offset"), ("b
 _VECTORS = {f.name for f in fields(Rig) if f.type == "Vec3"}
 
 
-def read_rig(path: Path) -> tuple[Rig, dict[str, str]]:
-    """Read ``rig.toml``.
+def read_rig(path: Path, *, fov: float | None = None) -> tuple[Rig, dict[str, str]]:
+    """Read ``rig.toml``. ``fov`` (from EXIF, say) is taken where the file gives none.
 
     Returns the rig and the file names it gives: ``{"pattern": ..., "sample": ...}``, where present.
     Raises `InputError` for a missing file, bad TOML, unknown or missing keys, wrong types or sizes.
@@ -209,6 +212,8 @@ def read_rig(path: Path) -> tuple[Rig, dict[str, str]]:
     for section, key in _REQUIRED:
         if _KEYS[section, key] not in values:
             raise InputError(f"{path}: [{section}] {key} is missing")
+    if fov is not None:
+        values.setdefault("fov", fov)
     return Rig(**values), files
 
 

@@ -1,0 +1,418 @@
+"""Finding the mirror ball in a photo.
+
+A hemisphere on the table has two sharp curves in a photo: its outline, and inside it the image of
+the horizon, where the mirror turns from showing the table to showing what is above it. Both are
+exact functions of the ball's place on the table and its radius, (x, y, radius) in metres: ``theta``
+below. Between the two the ball shows the table around it, which the photo shows as well: this part
+of the image can be predicted, and no coin or printed circle passes that test.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, optimize
+
+from invrender.errors import InputError
+from invrender.images import Photo
+from invrender.mirror import (
+    Ball,
+    horizon_points,
+    make_ball,
+    mirror_normals,
+    on_table,
+    outline_points,
+    place_ball,
+)
+from invrender.rig import Rig
+
+__all__ = ["Ball", "find_ball", "make_ball", "mirror_normals", "place_ball"]
+
+Array = NDArray[np.floating[Any]]
+RADIUS_PRIOR = 0.10  # how far the ball's radius in pixels may be from what the rig says
+MIN_RADIUS = 10.0  # pixels; below this the pattern in the ball cannot be read
+SEARCH = 3.0  # how many radii from where the rig puts it the ball is looked for
+MIN_CONFIDENCE = 0.5
+MIRROR_WEIGHT = 1.0
+OUTLINE_WEIGHT = 0.5  # of the outline beside the horizon: a mirror pales into the table there
+TOE = 0.1  # added to radiance over its median before the logarithm
+BLURS = (0.7, 1.4, 2.8, 5.6, 11.2)  # of the levels, in the view's pixels
+
+
+def find_ball(photo: Photo, rig: Rig, manual: tuple[float, float, float] | None = None) -> Ball:
+    """Find the mirror hemisphere in a photo; the rig says how big it is and about where.
+
+    Every place within `SEARCH` radii of the photo's middle is scored by how well the image's edges
+    run along the horizon's and the outline's curves there; the best few are refined and the winner
+    kept. ``manual`` (x, y, r) in pixels overrides the search. Raises `InputError` where no ball is
+    found with a confidence of `MIN_CONFIDENCE`, or where it is cut off, saturated or too small.
+    """
+    size = (photo.height, photo.width)
+    if manual is not None:
+        ball = place_ball(rig, size, *manual)
+        _check_exposure(photo, ball)
+        return ball
+    expected = make_ball(rig, rig.ball_centre, rig.ball_radius, size)
+    if expected.radius < MIN_RADIUS:
+        raise InputError(
+            f"the ball should be {expected.radius:.1f} pixels in radius by the rig, too small to "
+            "read: take a larger photo or check rig.toml"
+        )
+    middle = np.asarray(expected.centre)
+    view = _view(photo, middle, (SEARCH + 1.5) * expected.radius, expected.radius / 48)
+    starts = []
+    for start in _coarse(view, rig, expected):
+        theta = _climb(view, rig, start, 2, 0.08, 30)
+        starts.append((_score(view, rig, theta, 64, 1)[0], theta))
+    starts.sort(key=lambda pair: -pair[0])
+    best, theta = -math.inf, np.zeros(3)
+    for _, start in starts[:3]:
+        candidate = _climb(view, rig, _climb(view, rig, start, 1, 0.04, 40), 0, 0.02, 40)
+        score = _score(view, rig, candidate)[0]
+        if score > best:
+            best, theta = score, candidate
+    if best == -math.inf:
+        raise InputError("no mirror ball found: the photo shows nothing where the rig puts it")
+    found = make_ball(rig, np.array([theta[0], theta[1], 0.0]), theta[2], size)
+    confidence = _confidence(view, rig, theta)
+    fine = _view(photo, np.asarray(found.centre), 1.6 * found.radius, found.radius / 160)
+    theta = _polish(fine, rig, theta)
+    ball = make_ball(rig, np.array([theta[0], theta[1], 0.0]), theta[2], size, confidence)
+    (x, y), r = ball.centre, ball.radius
+    if confidence < MIN_CONFIDENCE:
+        raise InputError(
+            f"no mirror ball found (the best place, {x:.0f}, {y:.0f} with a radius of {r:.0f} "
+            f"pixels, has a confidence of {confidence:.2f}): give it by hand as x, y, radius"
+        )
+    if not (r <= x <= size[1] - r and r <= y <= size[0] - r):
+        raise InputError(f"the mirror ball at {x:.0f}, {y:.0f} is cut off by the edge of the photo")
+    _check_exposure(photo, ball)
+    return ball
+
+
+def _check_exposure(photo: Photo, ball: Ball) -> None:
+    (x, y), r = ball.centre, ball.radius * 0.7
+    y0, x0 = max(0, int(y - r)), max(0, int(x - r))
+    inside = slice(y0, int(y + r) + 1), slice(x0, int(x + r) + 1)
+    ys, xs = np.mgrid[inside]
+    disc = (xs + 0.5 - x) ** 2 + (ys + 0.5 - y) ** 2 < r * r
+    clipped = Photo(photo.image[inside], photo.clip_level).clipped
+    disc = disc[: clipped.shape[0], : clipped.shape[1]]
+    if disc.any() and clipped[disc].mean() > 0.5:
+        raise InputError("the mirror ball is saturated in the photo: expose it shorter")
+    if not photo.image[inside].max() > 0:
+        raise InputError("the mirror ball is black in the photo: expose it longer")
+
+
+@dataclass(frozen=True)
+class _View:
+    """A part of the photo, shrunk ``step`` times, ready to be compared with curves.
+
+    ``tensor`` (h, w, 3): xx, xy, yy of the image's structure tensor summed over the channels,
+    ``noise`` its usual trace; ``levels`` (5, h, w, 3) the linear image over its
+    median, ever more blurred. Photo pixel p is view position (p - origin) / step.
+    """
+
+    origin: Array
+    step: int
+    size: tuple[int, int]
+    tone: Array
+    levels: Array
+    tensor: Array
+    noise: float
+
+    def at(self, points: Array, rig: Rig) -> Array:
+        """Points in space to view positions (..., 2), x right, y down."""
+        return (rig.project(points, *self.size) - self.origin) / self.step
+
+
+def _view(photo: Photo, middle: Array, reach: float, shrink: float, sigma: float = 1.2) -> _View:
+    step = max(1, round(shrink))
+    low = np.maximum(np.floor(middle - reach), 0).astype(int)
+    high = np.minimum(np.ceil(middle + reach), [photo.width, photo.height]).astype(int)
+    count = np.maximum((high - low) // step, 1)
+    high = low + count * step
+    part = photo.image[low[1] : high[1], low[0] : high[0]]
+    part = part.reshape(count[1], step, count[0], step, 3).mean((1, 3))
+    level = max(float(np.median(part)), 1e-6 * float(part.max()), 1e-12)
+    part = np.minimum(part / level, 20.0)
+    tone = np.log(part + TOE)
+    levels = np.stack(
+        [ndimage.gaussian_filter(part, (a, a, 0), mode="nearest") for a in BLURS]
+    ).astype(np.float32)
+    smooth = ndimage.gaussian_filter(tone, (sigma, sigma, 0), mode="nearest")
+    gy, gx = (ndimage.correlate1d(smooth, [-0.5, 0, 0.5], axis=a, mode="nearest") for a in (0, 1))
+    tensor = np.stack([(gx * gx).sum(-1), (gx * gy).sum(-1), (gy * gy).sum(-1)], -1)
+    noise = float(np.median(tensor[..., 0] + tensor[..., 2])) + 1e-7
+    size = (photo.height, photo.width)
+    return _View(low.astype(float), step, size, tone, levels, tensor.astype(np.float32), noise)
+
+
+def _curves(view: _View, rig: Rig, theta: Array, count: int) -> tuple[Array, Array, Array, Array]:
+    """Horizon and outline in the view, each with its outward unit normals: (n, 2) four times."""
+    position = np.array([theta[0], theta[1], 0.0])
+    horizon = view.at(horizon_points(rig, position, theta[2], count), rig)
+    outline = view.at(outline_points(rig, position, theta[2], count), rig)
+    return horizon, _normals(horizon), outline, _normals(outline)
+
+
+def _normals(curve: Array) -> Array:
+    along = np.roll(curve, -1, 0) - np.roll(curve, 1, 0)
+    normal = np.stack([along[:, 1], -along[:, 0]], -1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    outward = np.sum(normal * (curve - curve.mean(0)), -1, keepdims=True)
+    return np.asarray(normal * np.where(outward < 0, -1, 1))
+
+
+def _alignment(view: _View, curve: Array, normal: Array) -> Array:
+    """How much of an edge runs along a curve at each of its points, (n,) in [0, 1].
+
+    The share of the structure tensor across the curve, with the usual trace added below so that
+    flat and noisy places count little. Blind to which side is the lighter one.
+    """
+    at = np.stack([curve[:, 1] - 0.5, curve[:, 0] - 0.5])
+    xx, xy, yy = (
+        ndimage.map_coordinates(view.tensor[..., k], at, order=1, mode="constant") for k in range(3)
+    )
+    nx, ny = normal[:, 0], normal[:, 1]
+    across = xx * nx * nx + 2 * xy * nx * ny + yy * ny * ny
+    return np.asarray(across / (xx + yy + 3 * view.noise))
+
+
+def _score(
+    view: _View, rig: Rig, theta: Array, count: int = 96, blur: int = 0
+) -> tuple[float, float, float, float]:
+    """Weighted sum of: the horizon's and the outline's share of edge, the mirrored table's fit."""
+    horizon, hn, outline, on = _curves(view, rig, theta, count)
+    h = float(_alignment(view, horizon, hn).mean())
+    o = float(_alignment(view, outline, on).mean())
+    m = _mirrored(view, rig, theta, blur)
+    return h + OUTLINE_WEIGHT * o + MIRROR_WEIGHT * m, h, o, m
+
+
+def _ring() -> tuple[Array, Array]:
+    """Normals (n, 3) of the part of a ball that mirrors the table near it, and for each the blur
+    level of `BLURS` that fits how much the mirror shrinks the table there."""
+    sine = np.linspace(0.80, 0.99, 14)
+    beta = np.arcsin(sine)
+    reach = sine + np.cos(beta) / np.tan(2 * beta - np.pi / 2)  # distance on the table, in radii
+    shrink = np.maximum(-np.gradient(reach, sine), 1)
+    level = np.clip(np.log2(shrink), 0, 3)
+    psi = np.arange(72) * (2 * np.pi / 72)
+    normal = np.stack(
+        [
+            sine[:, None] * np.cos(psi),
+            sine[:, None] * np.sin(psi),
+            np.broadcast_to(np.cos(beta)[:, None], (14, 72)),
+        ],
+        -1,
+    )
+    return normal.reshape(-1, 3), np.repeat(np.round(level).astype(int), 72)
+
+
+def _mirrored(view: _View, rig: Rig, theta: Array, blur: int = 0) -> float:
+    """How well the ball's rim shows the table around it, as the same photo shows that, in [0, 1].
+
+    1 - mean of a truncated square of the difference in log radiance; 0.5 if the photo shows nothing
+    of that table.
+    """
+    difference, valid = _mirror_difference(view, rig, theta, blur)
+    if valid.mean() < 0.25:
+        return 0.5
+    error = np.abs(difference[valid]).mean(-1)
+    return 1 - float(np.minimum(1, (error / 0.4) ** 2).mean())
+
+
+def _mirror_difference(
+    view: _View, rig: Rig, theta: Array, blur: int = 0
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Differences (n, 3) in log radiance between the ball's rim and the table it mirrors.
+
+    Each point of the ring between horizon and outline mirrors a point of the table; the photo
+    there, times the mirror's reflectance, should be the photo here. The mask (n,) says where the
+    photo shows that point of the table. Both are blurred by ``blur`` levels more than need be.
+    """
+    normal, level = _RING
+    level = np.minimum(level + blur, len(BLURS) - 1)
+    point = np.array([theta[0], theta[1], 0.0]) + theta[2] * normal
+    ray = point - rig.camera
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    mirrored = ray - 2 * np.sum(ray * normal, -1, keepdims=True) * normal
+    down = np.minimum(mirrored[:, 2:], -0.02)
+    table = view.at(point - mirrored * (point[:, 2:] / down), rig)
+    h, w = view.tone.shape[:2]
+    valid = (mirrored[:, 2] < -0.05) & (table > 0).all(-1) & (table < [w, h]).all(-1)
+    table = np.where(valid[:, None], table, 0)
+    expected = _look(view.levels, level, table) * np.asarray(rig.ball_reflectance)
+    seen = _look(view.levels, np.full_like(level, blur), view.at(point, rig))
+    return np.log(seen + TOE) - np.log(expected + TOE), valid
+
+
+def _look(levels: Array, level: Array, at: Array) -> Array:
+    """Bilinear look-ups (n, 3) in the chosen level at positions (n, 2), the border repeated."""
+    h, w = levels.shape[1:3]
+    x, y = np.clip(at[:, 0] - 0.5, 0, w - 1.001), np.clip(at[:, 1] - 0.5, 0, h - 1.001)
+    i, j = y.astype(int), x.astype(int)
+    fy, fx = (y - i)[:, None], (x - j)[:, None]
+    top = levels[level, i, j] * (1 - fx) + levels[level, i, j + 1] * fx
+    bottom = levels[level, i + 1, j] * (1 - fx) + levels[level, i + 1, j + 1] * fx
+    return np.asarray(top * (1 - fy) + bottom * fy)
+
+
+def _coarse(view: _View, rig: Rig, expected: Ball, keep: int = 10) -> list[Array]:
+    """The best few (x, y, radius) on the table, by scoring every pixel of the view."""
+    trace = view.tensor[..., 0] + view.tensor[..., 2] + 3 * view.noise
+    # Every second pixel will do: the curves of a ball of 48 pixels are that blurred anyway.
+    xx, xy, yy = (
+        ndimage.gaussian_filter(view.tensor[..., k] / trace, 1.5)[::2, ::2] for k in range(3)
+    )
+    h, w = xx.shape
+    centre = rig.ball_centre
+    middle = view.at(centre, rig)
+    margin = int(max(expected.ellipse[2:4]) / view.step / 2 * (1 + RADIUS_PRIOR)) + 2
+    found: list[tuple[float, float, float, float]] = []
+    xx, xy, yy = (np.pad(a, margin) for a in (xx, xy, yy))
+    for scale in np.linspace(1 - RADIUS_PRIOR, 1 + RADIUS_PRIOR, 6):
+        theta = np.array([centre[0], centre[1], expected.radius_m * scale])
+        hc, hn, oc, on = _curves(view, rig, theta, 48)
+        total = np.zeros((h, w), np.float32)
+        for curve, normal, weight in ((hc, hn, 1.0), (oc, on, OUTLINE_WEIGHT)):
+            shifts = np.round((curve - middle) / 2).astype(int) + margin
+            for (sx, sy), (nx, ny) in zip(shifts, normal.astype(np.float32), strict=True):
+                part = slice(sy, sy + h), slice(sx, sx + w)
+                total += np.float32(weight / 48) * (
+                    xx[part] * (nx * nx) + xy[part] * (2 * nx * ny) + yy[part] * (ny * ny)
+                )
+        peaks = total == ndimage.maximum_filter(total, 5)
+        for y, x in np.argwhere(peaks):
+            found.append((float(total[y, x]), 2 * x + 0.5, 2 * y + 0.5, theta[2]))
+    found.sort(reverse=True)
+    reach = SEARCH * expected.radius / view.step
+    chosen: list[Array] = []
+    places: list[tuple[float, float, float]] = []
+    for _, x, y, radius in found:
+        if math.hypot(x - middle[0], y - middle[1]) > reach:
+            continue
+        if any(math.hypot(x - a, y - b) < 6 and abs(radius / c - 1) < 0.05 for a, b, c in places):
+            continue
+        places.append((x, y, radius))
+        pixel = np.array([x, y]) * view.step + view.origin
+        at = on_table(rig, view.size, float(pixel[0]), float(pixel[1]))
+        chosen.append(np.array([at[0], at[1], radius]))
+        if len(chosen) == keep:
+            break
+    return chosen
+
+
+def _climb(view: _View, rig: Rig, start: Array, blur: int, reach: float, evaluations: int) -> Array:
+    """Move (x, y, radius) to a better score nearby (Nelder–Mead), ``reach`` in radii at first."""
+    unit = rig.ball_radius * reach
+
+    def cost(u: Array) -> float:
+        theta = start + u * unit
+        off = (theta[2] / rig.ball_radius - 1) / RADIUS_PRIOR
+        return -_score(view, rig, theta, 48, blur)[0] + 0.05 * off**2 + max(0.0, abs(off) - 1.5)
+
+    simplex = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]]) - 0.25
+    result = optimize.minimize(
+        cost, np.zeros(3), method="Nelder-Mead",
+        options={"initial_simplex": simplex, "xatol": 0.02, "fatol": 1e-4, "maxfev": evaluations},
+    )  # fmt: skip
+    return np.asarray(start + result.x * unit)
+
+
+def _polish(view: _View, rig: Rig, theta: Array, reach: float = 0.05) -> Array:
+    """Sub-pixel (x, y, radius) by robust least squares, Gauss–Newton.
+
+    Residuals are the distances along the horizon's normals to the strongest edge within ``reach``
+    radii, and the differences between the rim and the table it mirrors (which know the outline's
+    place even where it is no edge, in a contact shadow). Each kind is scaled by its own spread and
+    weighted as by a Cauchy distribution.
+    """
+    radius = float(
+        np.linalg.norm(np.diff(_curves(view, rig, theta, 2)[2], axis=0)) / 2
+    )  # in the view's pixels
+    for turn in range(12):
+        blur = max(0, 2 - turn // 2)
+        near = max(2.0, reach * radius * 0.8**turn)
+
+        def residuals(t: Array) -> Array:
+            return _mirror_difference(view, rig, t, blur)[0].reshape(-1)  # noqa: B023
+
+        moves = [theta + np.eye(3)[k] * theta[2] * 2e-3 for k in range(3)]
+        curve, normal = _curves(view, rig, theta, 240)[:2]
+        edge, strength = _edges(view, curve, normal, near)
+        shifted = [_curves(view, rig, m, 240)[0] for m in moves]
+        edge_slope = np.stack([np.sum((m - curve) * normal, -1) for m in shifted], -1) * 500
+        valid = np.repeat(_mirror_difference(view, rig, theta)[1], 3)
+        base = residuals(theta)
+        mirror_slope = np.stack([residuals(m) - base for m in moves], -1) * 500
+        offset = float(np.median(base[valid])) if valid.any() else 0.0
+        normal_matrix, right = 1e-9 * np.eye(3), np.zeros(3)
+        for r, slope, weight, floor in (
+            (-edge, edge_slope, strength, 0.1),
+            (base - offset, mirror_slope, valid * 1.0, 0.02),
+        ):
+            if weight.sum() < 20:
+                continue
+            spread = max(floor, 1.48 * float(np.median(np.abs(r[weight > 0.1]))))
+            k = weight / (1 + (r / spread) ** 2) / spread**2
+            normal_matrix = normal_matrix + slope.T @ (slope * k[:, None])
+            right = right - slope.T @ (k * r)
+        damped = normal_matrix + np.diag(np.diag(normal_matrix)) * 1e-3
+        step = np.linalg.solve(damped, right)
+        theta = theta + np.clip(step, -0.02, 0.02) * theta[2]
+    return theta
+
+
+def _edges(view: _View, curve: Array, normal: Array, reach: float) -> tuple[Array, Array]:
+    """Signed distance (n,) along each normal to the strongest edge, and its weight in [0, 1]."""
+    t = np.arange(-math.ceil(reach * 4) - 8, math.ceil(reach * 4) + 9) / 4
+    at = curve[:, None] + t[None, :, None] * normal[:, None]
+    at = np.stack([at[..., 1] - 0.5, at[..., 0] - 0.5])
+    slope = np.zeros(at.shape[1:])
+    for c in range(3):
+        line = ndimage.map_coordinates(view.tone[..., c], at, order=1, mode="nearest")
+        slope += ndimage.gaussian_filter1d(line, 3.0, axis=1, order=1, mode="nearest") ** 2
+    i = np.argmax(slope[:, 8:-8], 1) + 8
+    row = np.arange(len(curve))
+    a, b, c2 = (np.sqrt(slope[row, i + k]) for k in (-1, 0, 1))
+    bend = a - 2 * b + c2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shift = np.where(bend < 0, 0.5 * (a - c2) / bend, 0)
+    interior = (i > 8) & (i < len(t) - 9)
+    usual = np.median(slope) + 1e-8
+    strength = np.clip(b**2 / (30 * usual) - 0.5, 0, 1)
+    return t[i] + np.clip(shift, -0.5, 0.5) / 4, strength * interior
+
+
+def _features(view: _View, rig: Rig, theta: Array) -> Array:
+    """Six numbers (6,) that tell a ball from other round things.
+
+    The shares of edge along horizon and outline; the mirrored table's fit; the offset of that fit
+    (a printed ring is as light as the table, a mirror darker by its reflectance); how much more
+    edge the outline has than circles outside it; how much better the table fits than at a radius
+    that must be wrong.
+    """
+    _, h, o, m = _score(view, rig, theta)
+    difference, valid = _mirror_difference(view, rig, theta)
+    offset = float(np.median(difference[valid])) if valid.mean() > 0.25 else 0.0
+    beyond = np.mean([_score(view, rig, theta * [1, 1, k])[2] for k in (1.12, 1.2, 1.28)])
+    wrong = _mirrored(view, rig, theta * [1, 1, 1.3])
+    return np.array([h, o, m, abs(offset), o - beyond, m - wrong])
+
+
+def _confidence(view: _View, rig: Rig, theta: Array) -> float:
+    """Probability in [0, 1] that a ball stands at ``theta``: logistic in `_features`.
+
+    The weights were fitted to simulated photos with and without a ball.
+    """
+    weights = np.array([2.13, 0.67, 1.03, -6.08, 4.27, 11.58])
+    return float(1 / (1 + math.exp(3.43 - _features(view, rig, theta) @ weights)))
+
+
+_RING = _ring()

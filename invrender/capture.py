@@ -1,0 +1,240 @@
+"""A capture folder in; its lights and its sample out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, optimize
+
+from invrender.errors import InputError
+from invrender.images import Photo, read_image, read_photo
+from invrender.maps import Maps, read_maps
+from invrender.mirror import Ball
+from invrender.rig import Rig, read_rig
+from invrender.unfold import (
+    directions,
+    fill_environment,
+    predict_pattern,
+    screen_lookup,
+    solid_angles,
+    unfold_environment,
+    unfold_pattern,
+)
+
+Array = NDArray[np.floating[Any]]
+PHOTO_NAMES = tuple(f"photo.{e}" for e in ("exr", "tif", "tiff", "png", "jpg", "jpeg"))
+MIN_PHOTO = 64
+
+
+@dataclass(frozen=True)
+class Capture:
+    """One capture. ``pattern`` (h, w, 3) is the ideal one, relative radiance in [0, 1].
+
+    ``truth`` and ``true_environment`` come with synthetic captures only: to measure errors
+    against, never an input.
+    """
+
+    photo: Photo
+    rig: Rig
+    pattern: Array
+    truth: Maps | None = None
+    true_environment: Array | None = None
+
+
+@dataclass(frozen=True)
+class Lights:
+    """The light on the sample, in the photo's radiance units.
+
+    ``environment`` (H, 2H, 3): radiance, filled in behind the screen, nought below the horizon;
+    ``coverage`` (H, 2H): the share of each texel that the ball really shows. The screen's radiance
+    is ``gain`` (3,) times ``pattern`` (h, w, 3); ``pattern_captured`` is what the ball shows of it,
+    rectified. ``fit`` tells how well: ``residual`` of the pattern's fit relative to the gain,
+    ``gamma`` the exponent on the pattern that fits best (1: as it should be; the gain is for 1),
+    ``blur`` the camera's in pixels, ``pixels`` the number used.
+    """
+
+    environment: Array
+    coverage: Array
+    pattern: Array
+    gain: Array
+    pattern_captured: Array
+    fit: dict[str, float] = field(default_factory=dict)
+
+
+def load_capture(folder: Path) -> Capture:
+    """Read a capture folder: ``photo.*``, ``rig.toml``, the pattern, and the truth if there is any.
+
+    Raises `InputError`, one sentence, for anything missing, damaged or out of range.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder")
+    photos = [folder / n for n in PHOTO_NAMES if (folder / n).is_file()]
+    if not photos:
+        raise InputError(f"{folder} has no photo ({', '.join(PHOTO_NAMES)})")
+    if len(photos) > 1:
+        names = ", ".join(p.name for p in photos)
+        raise InputError(f"{folder} has more than one photo ({names}); leave one")
+    photo = read_photo(photos[0])
+    check_photo(photo, str(photos[0]))
+    rig, files = read_rig(folder / "rig.toml", fov=photo.fov)
+    pattern_path = _inside(folder, files.get("pattern") or _find_pattern(folder))
+    pattern = read_image(pattern_path)
+    if pattern.min() < 0 or pattern.max() > 1 + 1e-3:
+        raise InputError(f"{pattern_path}: the pattern must be relative radiance in [0, 1]")
+    if not pattern.max() > 0:
+        raise InputError(f"{pattern_path}: the pattern is all black")
+    truth = environment = None
+    if "sample" in files:
+        maps = _inside(folder, files["sample"])
+        truth = read_maps(maps)
+        if (maps / "environment.exr").is_file():
+            environment = read_image(maps / "environment.exr")
+    return Capture(photo, rig, np.clip(pattern, 0, 1), truth, environment)
+
+
+def check_photo(photo: Photo, name: str = "the photo") -> None:
+    """Raise `InputError` for a photo that cannot be a capture: too small, or black."""
+    if min(photo.height, photo.width) < MIN_PHOTO:
+        raise InputError(
+            f"{name} is {photo.width} × {photo.height} pixels, too small for a capture"
+        )
+    if not photo.image.max() > 0:
+        raise InputError(f"{name} is all black")
+
+
+def _inside(folder: Path, name: str) -> Path:
+    """A file named in ``rig.toml``; it must lie in the capture's folder."""
+    path = folder / name
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise InputError(f"{folder}/rig.toml: '{name}' leads out of the capture's folder")
+    return path
+
+
+def _find_pattern(folder: Path) -> str:
+    for name in ("pattern.exr", "pattern.png"):
+        if (folder / name).is_file():
+            return name
+    raise InputError(f"{folder} has no pattern: set [pattern] image in rig.toml")
+
+
+def crop_sample(photo: Photo, rig: Rig, size: int = 256, order: int = 3) -> Array:
+    """The sample's square of the photo as (size, size, 3) radiance, row 0 at +y.
+
+    Each pixel is the mean over its square of the sample when the photo is finer than the crop, and
+    interpolated by cubic splines where it is coarser. Raises `InputError` if the sample is not
+    whole in the photo.
+    """
+    if size < 1:
+        raise InputError(f"the sample's size must be at least one pixel, got {size}")
+    h, w = photo.height, photo.width
+    corners = rig.project(rig.sample_points(2, 2) * 2, h, w)
+    if not (
+        np.isfinite(corners).all()
+        and (corners >= -0.5).all()
+        and (corners <= np.array([w, h]) + 0.5).all()
+    ):
+        raise InputError("the sample reaches beyond the photo: check the rig's sizes and fov")
+    low, high = corners.reshape(-1, 2).min(0), corners.reshape(-1, 2).max(0)
+    x0, y0 = np.maximum(np.floor(low).astype(int) - 8, 0)
+    x1, y1 = np.minimum(np.ceil(high).astype(int) + 8, [w, h])
+    crop = photo.image[y0:y1, x0:x1]
+    scale = float((high - low).max()) / size  # photo pixels in one of the crop's
+    samples = max(1, math.ceil(scale))
+    pixels = rig.project(rig.sample_points(size * samples, size * samples), h, w)
+    at = np.stack([pixels[..., 1] - y0 - 0.5, pixels[..., 0] - x0 - 0.5])
+    planes = []
+    for c in range(3):
+        plane = ndimage.map_coordinates(crop[..., c], at, order=order, mode="nearest")
+        planes.append(plane.reshape(size, samples, size, samples).mean((1, 3)))
+    return np.maximum(np.stack(planes, -1), 0).astype(np.float32)
+
+
+def fit_gain(photo: Photo, rig: Rig, ball: Ball, pattern: Array) -> tuple[Array, dict[str, float]]:
+    """Gain (3,) of the screen: its radiance over the ideal pattern, from the ball's image.
+
+    Every pixel inside the screen's image is compared with what it should average of the pattern,
+    under the camera's blur, which is fitted as well. Weights fall with the residual (iteratively
+    reweighted least squares, Huber); saturated pixels are left out. ``fit`` as in `Lights`. Raises
+    `InputError` if the ball does not show the screen, or shows it dark.
+    """
+    lookup, hit, (rows, columns) = screen_lookup(rig, ball, pattern.shape[:2])
+    # Only the part of the window that shows the screen, and around it what blurs into it.
+    inside = np.argwhere(hit)
+    if len(inside) == 0:
+        raise InputError("the ball cannot show the screen: check the rig's sizes")
+    low = np.maximum(inside.min(0) // 4 - 4, 0)
+    high = inside.max(0) // 4 + 5
+    part = slice(4 * low[0], 4 * high[0]), slice(4 * low[1], 4 * high[1])
+    lookup, hit = lookup[part], hit[part]
+    rows = slice(rows.start + low[0], min(rows.start + high[0], rows.stop))
+    columns = slice(columns.start + low[1], min(columns.start + high[1], columns.stop))
+    captured = photo.image[rows, columns] / np.asarray(rig.ball_reflectance)
+    # Pixels that see nothing but the screen, and whose neighbours do.
+    whole = predict_pattern(pattern, lookup, hit, 0)[..., 3] > 0.999
+    use = ndimage.binary_erosion(whole) & ~photo.clipped[rows, columns]
+    if use.sum() < 12:
+        raise InputError(
+            "the ball's image shows too little of the screen, or it is saturated there"
+        )
+    values = captured[use].astype(float)
+
+    def solve(blur: float, gamma: float) -> tuple[float, Array]:
+        predicted = predict_pattern(pattern**gamma, lookup, hit, blur)[use][:, :3].astype(float)
+        gain = np.zeros(3)
+        squares = 0.0
+        for c in range(3):
+            x, y = predicted[:, c], values[:, c]
+            weight = np.ones_like(x)
+            for _ in range(15):
+                gain[c] = (weight * x * y).sum() / max((weight * x * x).sum(), 1e-12)
+                error = np.abs(y - gain[c] * x)
+                spread = max(2 * float(np.median(error)), 1e-12)
+                weight = np.minimum(1, spread / np.maximum(error, 1e-12))
+            squares += float((weight * error**2).sum() / weight.sum())
+        return math.sqrt(squares / 3) / max(float(gain.mean()), 1e-12), gain
+
+    def cost(u: Array) -> float:
+        outside = max(0.0, -u[0]) + max(0.0, u[0] - 3) + 5 * max(0.0, abs(u[1]) - 1)
+        return solve(min(max(u[0], 0.0), 3.0), math.exp(u[1]))[0] * (1 + outside)
+
+    start = np.array([[0.2, 0.0], [1.0, 0.0], [0.2, 0.2]])
+    options = {"initial_simplex": start, "xatol": 0.005, "fatol": 1e-5, "maxfev": 60}
+    found = optimize.minimize(cost, start[0], method="Nelder-Mead", options=options)
+    blur, gamma = min(max(float(found.x[0]), 0.0), 3.0), math.exp(float(found.x[1]))
+    residual, gain = solve(blur, 1.0)
+    if not (gain > 0).all():
+        raise InputError("the screen is dark in the ball's image: is the pattern displayed?")
+    fit = {"residual": residual, "gamma": gamma, "blur": blur, "pixels": float(use.sum())}
+    return gain, fit
+
+
+def extract_lights(capture: Capture, ball: Ball, height: int = 128) -> Lights:
+    """Unfold the ball: the environment (``height`` rows) and the screen's pattern and gain."""
+    photo, rig = capture.photo, capture.rig
+    if ball.size != (photo.height, photo.width):
+        raise InputError("the ball was found in a photo of another size")
+    if height < 8 or height % 2:
+        raise InputError(f"the environment needs an even height of 8 rows or more, got {height}")
+    environment, coverage = unfold_environment(photo, rig, ball, height)
+    environment = fill_environment(environment, coverage)
+    gain, fit = fit_gain(photo, rig, ball, capture.pattern)
+    captured = unfold_pattern(photo, rig, ball, min(256, max(capture.pattern.shape[:2])))
+    return Lights(environment, coverage, capture.pattern, gain, captured, fit)
+
+
+def plane_irradiance(environment: Array, weight: Array | None = None) -> Array:
+    """Irradiance (3,) on the plane z = 0: ∫ L cos θ dω over the upper hemisphere.
+
+    ``weight`` (H, 2H), if given, multiplies the radiance (a visibility, say).
+    """
+    height = environment.shape[0]
+    cosine = np.maximum(directions(height)[..., 2], 0) * solid_angles(height)[:, None]
+    if weight is not None:
+        cosine = cosine * weight
+    return np.asarray((environment * cosine[..., None]).sum((0, 1)))

@@ -1,0 +1,43 @@
+"""Materials to train and test on: made up, read from files, and varied.
+
+The work is done in the modules beside this one; this is what others import.
+"""
+
+from invrender.materials_augment import (
+    augment,
+    check_maps,
+    crop_maps,
+    jitter_maps,
+    mix,
+    resize_maps,
+    rotate_maps,
+    turn_maps,
+)
+from invrender.materials_files import (
+    find_materials,
+    handedness,
+    is_directx,
+    load_materials,
+    read_material,
+)
+from invrender.materials_patterns import normals_from_height
+from invrender.materials_procedural import PRESETS, procedural_material
+
+__all__ = [
+    "PRESETS",
+    "augment",
+    "check_maps",
+    "crop_maps",
+    "find_materials",
+    "handedness",
+    "is_directx",
+    "jitter_maps",
+    "load_materials",
+    "mix",
+    "normals_from_height",
+    "procedural_material",
+    "read_material",
+    "resize_maps",
+    "rotate_maps",
+    "turn_maps",
+]

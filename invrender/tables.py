@@ -1,0 +1,364 @@
+"""What the fast estimator reads: filtered lights, irradiance tables, lamps one by one.
+
+Built from a `Scene` by Dr.Jit code, so that gradients pass through to the lights and the pose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from invrender.backend import dr, vector
+from invrender.pyramid import Pyramid, disc, disc_direction, level_offset
+from invrender.scene import Scene, environment_at, hit_screen, pattern_at
+
+HOT_SHARE = 0.004  # a texel whose flux exceeds this share of the environment's is a lamp of its own
+MAX_HOT = 64
+LAMP_SIDES = (1, 2, 3, 4)  # points a side in a lamp, for lobes of falling width
+T_SIZE = 32  # normals a side in the table of T
+T_EXTENT = 1.1  # of its square beyond the unit disc, so that the rim is interpolated too
+V_SIZE = 16  # sample points a side in the table of V
+QUAD = 32  # screen cells a side in V's quadrature
+
+
+@dataclass
+class Tables:
+    """What the fast estimator reads; rebuilt when the lights or the screen's pose change.
+
+    screen: RGBA pyramid of gain × pattern. sky: RGBA pyramid of the environment above the table on
+    Lambert's disc, without its lamps and what the screen hides from the whole sample (A = 0 there).
+    sky_irradiance: T(n), its irradiance on a disc of normals.
+    vector_irradiance: V(x) of the screen minus that of the sky behind it, 9 values on a grid over
+    the sample. Lamps: directions, polar extents and flux of the brightest texels.
+    """
+
+    scene: Scene
+    screen: Pyramid | None
+    sky: Pyramid | None
+    sky_irradiance: Any | None
+    vector_irradiance: Any | None
+    lamp_points: Any | None
+    lamp_radiance: Any | None
+    lamp_count: int  # of those not hidden from the whole sample
+    lamp_open: int  # the first so many are hidden from no part of it
+
+
+def fast_tables(scene: Scene) -> Tables:
+    """Build the `Tables` of a scene, differentiably with respect to all of its fields."""
+    tables = Tables(scene, None, None, None, None, None, None, 0, 0)
+    if scene.pattern is not None:
+        tables.screen = _screen_pyramid(scene)
+    if scene.environment is not None:
+        _split_lamps(tables)
+        tables.sky_irradiance = _sky_irradiance(tables)
+    if scene.pattern is not None or scene.environment is not None:
+        tables.vector_irradiance = _vector_irradiance(tables)
+    return tables
+
+
+def _power_of_two(n: int) -> int:
+    return 1 << max(n - 1, 0).bit_length()
+
+
+def _grid(uint: type, scalar: type, n: int) -> tuple[Any, Any]:
+    """Centres of n × n cells in [0, 1]², row order."""
+    i = dr.arange(uint, n * n)
+    row = i // n
+    return (scalar(i - row * n) + 0.5) / n, (scalar(row) + 0.5) / n
+
+
+def _screen_pyramid(scene: Scene) -> Pyramid:
+    scalar = scene.scalar
+    n = _power_of_two(scene.pattern_size)
+    x, y = _grid(dr.uint32_array_t(scalar), scalar, n)
+    rgb = pattern_at(scene, x, 1 - y)
+    return Pyramid.build(vector(scalar, 4)(rgb.x, rgb.y, rgb.z, 1), n)
+
+
+def _split_lamps(tables: Tables) -> None:
+    """Take the few brightest texels out of the environment and filter the rest.
+
+    A texel above the table whose flux exceeds `HOT_SHARE` of the whole keeps that share; what is
+    above becomes a lamp that is sampled by itself. The split is a constant factor a texel, so both
+    parts stay linear in the environment.
+    """
+    scene = tables.scene
+    scalar = scene.scalar
+    uint, vec3, vec4 = dr.uint32_array_t(scalar), vector(scalar, 3), vector(scalar, 4)
+    h = scene.env_height
+    w = 2 * h
+    env = np.asarray(dr.detach(scene.environment)).reshape(h, w, 3).astype(np.float64)
+    theta = (np.arange(h) + 0.5) / h * np.pi
+    flux = env.mean(-1) * np.sin(theta)[:, None]
+    flux[theta > np.pi / 2] = 0
+    limit = HOT_SHARE * flux.sum()
+    hot = np.flatnonzero(flux > limit)
+    hot = hot[np.argsort(-flux.ravel()[hot], kind="stable")][:MAX_HOT]
+    keep = np.ones(h * w)
+    keep[hot] = limit / flux.ravel()[hot] if len(hot) else 1
+    rest = scene.environment
+    if len(hot):
+        rest = rest * scalar(np.repeat(keep, 3))
+        theta, phi = (hot // w + 0.5) * np.pi / h, (hot % w + 0.5) * np.pi / h
+        d = vec3(np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta))
+        hidden, partly = (
+            np.broadcast_to(np.array(m), len(hot))
+            for m in _corner_hits(dr.detach(scene), d, np.pi / h)
+        )
+        hot = np.concatenate([hot[~partly], hot[partly & ~hidden]])
+        tables.lamp_count, tables.lamp_open = len(hot), int((~partly).sum())
+    if len(hot):
+        index = uint(hot.astype(np.uint32))
+        lamp = dr.gather(vec3, scene.environment, index) * (1 - scalar(keep[hot]))
+        tables.lamp_radiance = dr.ravel(lamp * scene.scale)
+        _lamp_points(tables, hot)
+    without = replace(scene, environment=rest)
+
+    n = min(_power_of_two(h), 512)
+    sub = 2  # 2 × 2 sub-texels, each a bilinear look-up
+    x, y = _grid(uint, scalar, n)
+    total = vec4(0)
+    for i in range(sub * sub):
+        px = x * 2 - 1 + ((i % sub + 0.5) / sub - 0.5) * (2 / n)
+        py = 1 - y * 2 + ((i // sub + 0.5) / sub - 0.5) * (2 / n)
+        inside = px * px + py * py < 1
+        d = disc_direction(dr.select(inside, px, 0), dr.select(inside, py, 0), vec3)
+        hidden, _ = _corner_hits(dr.detach(scene), d, 0)
+        seen = dr.select(inside & ~hidden, environment_at(without, d), 0)
+        total += vec4(seen.x, seen.y, seen.z, dr.select(inside & hidden, scalar(0), 1))
+    tables.sky = Pyramid.build(total / (sub * sub), n)
+
+
+def _corner_hits(scene: Scene, d: Any, margin: float) -> tuple[Any, Any]:
+    """For far directions d: whether the screen hides them from all of the sample; whether it may
+    hide them from some of it.
+
+    The screen's shadow along d is a parallelogram and the sample is convex, so its corners decide.
+    ``margin`` (radians) is the width of what lies in direction d.
+    """
+    if scene.pattern is None:
+        no = dr.mask_t(scene.scalar)(False)
+        return no, no
+    vec3 = type(d)
+    edge = dr.minimum(dr.norm(scene.edge_x), dr.norm(scene.edge_y))
+    hidden: Any = True
+    sides: list[Any] = [True] * 4  # all corners beyond the same side of the screen
+    for sx, sy in ((-1, -1), (1, -1), (-1, 1), (1, 1)):
+        x = vec3(sx * scene.half, sy * scene.half, 0)
+        s, t, r, cos, _ = hit_screen(scene, x, d)
+        width = margin * r / (dr.maximum(cos, 1e-3) * edge)
+        up = cos > 1e-3
+        hidden &= up & (s > width) & (s < 1 - width) & (t > width) & (t < 1 - width)
+        beyond = (s < -width, s > 1 + width, t < -width, t > 1 + width)
+        sides = [a & (~up | b) for a, b in zip(sides, beyond, strict=True)]
+    return hidden, ~(sides[0] | sides[1] | sides[2] | sides[3])
+
+
+def _lamp_points(tables: Tables, hot: np.ndarray) -> None:
+    """Precompute each lamp's points: 1, 4, 9 and 16 strata of its bilinear tent.
+
+    Lamps that the whole screen hides from the whole sample are dropped; those that it hides from
+    nobody come first, so that only the rest are tested for occlusion.
+    """
+    scene = tables.scene
+    scalar = scene.scalar
+    h = scene.env_height
+    blocks = []
+    for side in LAMP_SIDES:
+        strata = (np.arange(side) + 0.5) / side
+        tent = np.where(strata < 0.5, np.sqrt(2 * strata) - 1, 1 - np.sqrt(2 - 2 * strata))
+        theta = (hot[:, None, None] // (2 * h) + 0.5 + tent[None, :, None]) * (np.pi / h)
+        phi = (hot[:, None, None] % (2 * h) + 0.5 + tent[None, None, :]) * (np.pi / h)
+        theta, phi = np.broadcast_arrays(theta, phi)
+        weight = np.abs(np.sin(theta)) * (np.pi / h) ** 2 / side**2
+        points = [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta), weight]
+        blocks.append(np.stack(points, -1).reshape(-1))
+    tables.lamp_points = scalar(np.concatenate(blocks))
+
+
+def lamp_point(tables: Tables, i: Any, side: Any) -> tuple[Any, Any, Any]:
+    """Point i of the lamps at side² points a lamp: (direction, its solid angle, radiance)."""
+    scalar = tables.scene.scalar
+    vec3, vec4 = vector(scalar, 3), vector(scalar, 4)
+    # Points of the coarser subdivisions come before: 0, 1, 1 + 4, 1 + 4 + 9 a lamp.
+    before = (side - 1) * side * (2 * side - 1) // 6 * tables.lamp_count
+    point = dr.gather(vec4, tables.lamp_points, before + i)
+    radiance = dr.gather(vec3, tables.lamp_radiance, i // (side * side))
+    return vec3(point.x, point.y, point.z), point.w, radiance
+
+
+def sky_at(tables: Tables, d: Any, solid_angle: Any, bias: float = 0.0) -> Any:
+    """RGBA of the sky pyramid along d, averaged over about ``solid_angle``.
+
+    RGB is the average of what any point of the sample can see, A the share of the footprint that
+    it covers: RGB/A is the mean radiance of the part that the screen does not always hide.
+    """
+    assert tables.sky is not None
+    n = tables.sky.n
+    x, y = disc(d)
+    # A texel of the disc has area (2/n)² and twice that in solid angle.
+    level = 0.5 * dr.log2(solid_angle * (n * n / 8)) + bias
+    return tables.sky(dr.fma(x, 0.5, 0.5), dr.fma(y, -0.5, 0.5), level)
+
+
+def screen_at(tables: Tables, s: Any, t: Any, area: Any, bias: float = 0.0) -> Any:
+    """RGBA of the screen averaged over about ``area`` (of the unit square) around (s, t)."""
+    assert tables.screen is not None
+    n = tables.screen.n
+    return tables.screen(s, 1 - t, 0.5 * dr.log2(area * (n * n)) + bias)
+
+
+def _sky_irradiance(tables: Tables) -> Any:
+    """T(n) = ∫ L (n·l)+ dl over z > 0, on T_SIZE² normals of the disc; flat RGBA."""
+    assert tables.sky is not None
+    scalar = tables.scene.scalar
+    uint, vec3, vec4 = dr.uint32_array_t(scalar), vector(scalar, 3), vector(scalar, 4)
+    sky = tables.sky
+    level = max(sky.n.bit_length() - 7, 0)  # 64 × 64 directions
+    m = sky.n >> level
+    # The table reaches past the rim, so that interpolation near it reads sensible normals.
+    x, y = _grid(uint, scalar, T_SIZE)
+    x, y = (x * 2 - 1) * T_EXTENT, (y * 2 - 1) * T_EXTENT
+    scale = dr.minimum(1, 1.3 * dr.rsqrt(dr.maximum(x * x + y * y, 1e-12)))
+    normal = disc_direction(x * scale, y * scale, vec3)
+
+    def body(i: Any, total: Any) -> tuple[Any, Any]:
+        row = i // m
+        column = i - row * m
+        px = (scalar(column) + 0.5) * (2 / m) - 1
+        py = 1 - (scalar(row) + 0.5) * (2 / m)
+        inside = px * px + py * py < 1.02
+        d = dr.normalize(disc_direction(px, py, vec3))
+        texel = level_offset(sky.n, level) + (row + 1) * (m + 2) + column + 1
+        radiance = dr.gather(vec4, sky.texels, texel, inside)
+        cos = dr.maximum(dr.dot(normal, d), 0)
+        return i + 1, total + cos * vec3(radiance.x, radiance.y, radiance.z)
+
+    _, total = dr.while_loop(
+        (dr.opaque(uint, 0), dr.zeros(vec3, T_SIZE * T_SIZE)),
+        lambda i, _: i < dr.opaque(uint, m * m),
+        body,
+        max_iterations=-1,
+        label="sky irradiance",
+    )
+    total *= 8 / (m * m)
+    return dr.ravel(vec4(total.x, total.y, total.z, 0))
+
+
+def sky_irradiance_at(tables: Tables, n: Any) -> Any:
+    """T(n) by Catmull–Rom interpolation: smooth, so that its gradient is one too."""
+    scalar = tables.scene.scalar
+    uint, sint = dr.uint32_array_t(scalar), dr.int32_array_t(scalar)
+    vec3, vec4 = vector(scalar, 3), vector(scalar, 4)
+    x, y = disc(n)
+    size = T_SIZE
+    px = dr.fma(x, 0.5 / T_EXTENT * size, 0.5 * size - 0.5)
+    py = dr.fma(y, 0.5 / T_EXTENT * size, 0.5 * size - 0.5)
+    ix, iy = sint(dr.floor(px)), sint(dr.floor(py))
+    wx, wy = _catmull_rom(px - scalar(ix)), _catmull_rom(py - scalar(iy))
+    total = vec4(0)
+    for j in range(4):
+        row = dr.clip(iy + (j - 1), 0, size - 1) * size
+        line = vec4(0)
+        for i in range(4):
+            column = dr.clip(ix + (i - 1), 0, size - 1)
+            line = dr.fma(dr.gather(vec4, tables.sky_irradiance, uint(row + column)), wx[i], line)
+        total = dr.fma(line, wy[j], total)
+    return vec3(total.x, total.y, total.z)
+
+
+def _catmull_rom(f: Any) -> list[Any]:
+    f2, f3 = f * f, f * f * f
+    return [
+        0.5 * (-f + 2 * f2 - f3),
+        0.5 * (2 - 5 * f2 + 3 * f3),
+        0.5 * (f + 4 * f2 - 3 * f3),
+        0.5 * (f3 - f2),
+    ]
+
+
+def screen_cell(tables: Tables, x: Any, i: Any, side: int) -> tuple[Any, Any, Any]:
+    """Cell i of a side × side grid over the screen, seen from x: (unit direction, solid angle,
+    radiance that the screen adds to the sky there), the midpoint rule's nodes."""
+    scene = tables.scene
+    scalar = scene.scalar
+    uint, vec3, vec4 = dr.uint32_array_t(scalar), vector(scalar, 3), vector(scalar, 4)
+    row = i // side
+    column = i - row * side
+    s, t = (scalar(column) + 0.5) / side, 1 - (scalar(row) + 0.5) / side
+    to = scene.corner + s * scene.edge_x + t * scene.edge_y - x
+    normal = dr.cross(scene.edge_x, scene.edge_y)
+    distance2 = dr.squared_norm(to)
+    d = to * dr.rsqrt(distance2)
+    omega = dr.maximum(dr.dot(normal, d), 0) / distance2 * (1 / (side * side))
+    radiance = vec3(0)
+    if tables.screen is not None:
+        pyramid = tables.screen
+        if pyramid.n >= side:
+            level = (pyramid.n // side).bit_length() - 1
+            width = side + 2
+            place = level_offset(pyramid.n, level) + (row + 1) * width + column + 1
+            texel = dr.gather(vec4, pyramid.texels, uint(place))
+        else:
+            texel = pyramid(s, 1 - t, scalar(0))
+        radiance = vec3(texel.x, texel.y, texel.z)
+    if tables.sky is not None:
+        sky = sky_at(tables, d, omega, -0.5)
+        radiance = radiance - vec3(sky.x, sky.y, sky.z)
+    return d, omega, radiance
+
+
+def _vector_irradiance(tables: Tables) -> Any:
+    """V(x) = ∫ (L_screen - L_sky) l dl over the screen's solid angle; flat, 12 values a point."""
+    scene = tables.scene
+    scalar = scene.scalar
+    uint, vec3 = dr.uint32_array_t(scalar), vector(scalar, 3)
+    u, v = _grid(uint, scalar, V_SIZE)
+    # Nodes at the sample's corners and between, so that no point of it is extrapolated.
+    stretch = V_SIZE / (V_SIZE - 1)
+    x = vec3((u - 0.5) * stretch * 2 * scene.half, (0.5 - v) * stretch * 2 * scene.half, scalar(0))
+
+    def body(i: Any, a: Any, b: Any, c: Any) -> tuple[Any, Any, Any, Any]:
+        d, omega, radiance = screen_cell(tables, x, i, QUAD)
+        radiance = radiance * omega
+        return i + 1, a + radiance * d.x, b + radiance * d.y, c + radiance * d.z
+
+    zero = dr.zeros(vec3, V_SIZE * V_SIZE)
+    _, a, b, c = dr.while_loop(
+        (dr.opaque(uint, 0), zero, vec3(zero), vec3(zero)),
+        lambda i, *_: i < dr.opaque(uint, QUAD * QUAD),
+        body,
+        max_iterations=-1,
+        label="vector irradiance",
+    )
+    flat = dr.zeros(scalar, 12 * V_SIZE * V_SIZE)
+    i = dr.arange(uint, V_SIZE * V_SIZE) * 3
+    vec4 = vector(scalar, 4)
+    for k, part in enumerate((a, b, c)):
+        dr.scatter(flat, vec4(part.x, part.y, part.z, 0), i + k, mode=dr.ReduceMode.NoConflicts)
+    return flat
+
+
+def vector_irradiance_at(tables: Tables, x: Any) -> tuple[Any, Any, Any]:
+    """V(x) by bilinear interpolation: the RGB factors of n.x, n.y and n.z."""
+    scene = tables.scene
+    scalar = scene.scalar
+    uint, vec3, vec4 = dr.uint32_array_t(scalar), vector(scalar, 3), vector(scalar, 4)
+    last = V_SIZE - 1
+    px = dr.clip(dr.fma(x.x, 0.5 / scene.half, 0.5) * last, 0, last - 1e-3)
+    py = dr.clip(dr.fma(x.y, -0.5 / scene.half, 0.5) * last, 0, last - 1e-3)
+    ix, iy = uint(px), uint(py)
+    fx, fy = px - scalar(ix), py - scalar(iy)
+    i = iy * V_SIZE + ix
+    parts = []
+    for k in range(3):
+        fetch = lambda j, k=k: dr.gather(vec4, tables.vector_irradiance, 3 * j + k)  # noqa: E731
+        value = dr.lerp(
+            dr.lerp(fetch(i), fetch(i + 1), fx),
+            dr.lerp(fetch(i + V_SIZE), fetch(i + V_SIZE + 1), fx),
+            fy,
+        )
+        parts.append(vec3(value.x, value.y, value.z))
+    return parts[0], parts[1], parts[2]

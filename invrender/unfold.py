@@ -1,0 +1,243 @@
+"""From the mirror ball's image to the light: the environment, and the pattern on the screen.
+
+Everything follows single rays: a photo's pixel sees a point of the ball, and there, mirrored, a
+direction. Nothing is taken as infinitely far or orthographic except the environment itself.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, sparse
+from scipy.sparse.linalg import spsolve
+
+from invrender.errors import InputError
+from invrender.images import Photo
+from invrender.mirror import Ball, mirror_normals
+from invrender.rig import Rig
+
+Array = NDArray[np.floating[Any]]
+Mask = NDArray[np.bool_]
+SCREEN_MARGIN = 1.5  # pixels around the screen's image that may hold some of its light
+
+
+def directions(height: int, rows: Array | None = None, columns: Array | None = None) -> Array:
+    """Unit directions of an equirectangular map's texels, (H, 2H, 3) without ``rows``/``columns``.
+
+    Rows and columns may be given as fractions of the map's height and width.
+    """
+    v = (np.arange(height) + 0.5) / height if rows is None else rows
+    u = (np.arange(2 * height) + 0.5) / (2 * height) if columns is None else columns
+    theta, phi = np.meshgrid(np.pi * v, 2 * np.pi * u, indexing="ij")
+    return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
+
+
+def solid_angles(height: int) -> Array:
+    """Solid angle of each texel by row, (H,), in steradians."""
+    edge = np.cos(np.pi * np.arange(height + 1) / height)
+    return (edge[:-1] - edge[1:]) * (2 * np.pi / (2 * height))
+
+
+def screen_coordinates(rig: Rig, origin: Array, direction: Array) -> tuple[Array, Array, Mask]:
+    """Where rays meet the screen: (s, t) along its edges, and whether within its rectangle."""
+    e_x, e_y = rig.screen_edges
+    normal = np.cross(e_x, e_y)
+    along = direction @ normal
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = ((rig.screen_corner - origin) @ normal) / along
+        point = origin + distance[..., None] * direction - rig.screen_corner
+        s, t = point @ e_x / (e_x @ e_x), point @ e_y / (e_y @ e_y)
+        hit = (distance > 0) & (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1)
+    return s, t, hit
+
+
+def trace_ball(rig: Rig, ball: Ball, pixels: Array) -> tuple[Array, Array, Mask]:
+    """Points on the ball and mirrored unit directions, both (..., 3), for photo pixels (..., 2).
+
+    The mask says which pixels see the hemisphere at all; the rest is undefined.
+    """
+    ray = rig.rays(pixels, *ball.size)
+    centre = np.asarray(ball.position)
+    to_ball = centre - rig.camera
+    b = ray @ to_ball
+    discriminant = b * b - to_ball @ to_ball + ball.radius_m**2
+    distance = b - np.sqrt(np.maximum(discriminant, 0))
+    point = rig.camera + distance[..., None] * ray
+    normal = (point - centre) / ball.radius_m
+    mirrored = ray - 2 * np.sum(ray * normal, -1, keepdims=True) * normal
+    return point, mirrored, (discriminant > 0) & (point[..., 2] >= 0)
+
+
+def window(ball: Ball, margin: float = 4.0) -> tuple[slice, slice]:
+    """Rows and columns of the photo that hold the ball."""
+    (x, y), r = ball.centre, max(ball.ellipse[2:4]) + margin
+    h, w = ball.size
+    return (
+        slice(max(0, math.floor(y - r)), min(h, math.ceil(y + r))),
+        slice(max(0, math.floor(x - r)), min(w, math.ceil(x + r))),
+    )
+
+
+def pixel_grid(rows: slice, columns: slice, samples: int = 1) -> Array:
+    """Positions (H·samples, W·samples, 2) evenly within the pixels of a window."""
+    y = rows.start + (np.arange((rows.stop - rows.start) * samples) + 0.5) / samples
+    x = columns.start + (np.arange((columns.stop - columns.start) * samples) + 0.5) / samples
+    return np.stack(np.broadcast_arrays(x[None, :], y[:, None]), -1)
+
+
+def sample_image(image: Array, pixels: Array, origin: tuple[int, int] = (0, 0)) -> Array:
+    """Bilinear look-ups (..., C) at pixels (..., 2); the image starts at ``origin`` (row, col)."""
+    at = np.stack([pixels[..., 1] - origin[0] - 0.5, pixels[..., 0] - origin[1] - 0.5])
+    planes = image[..., None] if image.ndim == 2 else image
+    out = [
+        ndimage.map_coordinates(planes[..., c], at, order=1, mode="nearest")
+        for c in range(planes.shape[-1])
+    ]
+    return np.stack(out, -1) if image.ndim == 3 else out[0]
+
+
+def screen_mask(rig: Rig, ball: Ball, margin: float) -> tuple[Array, tuple[slice, slice]]:
+    """1 where the ball's image shows the screen, grown by ``margin`` pixels; and its window."""
+    rows, columns = area = window(ball)
+    point, mirrored, seen = trace_ball(rig, ball, pixel_grid(rows, columns))
+    _, _, hit = screen_coordinates(rig, point, mirrored)
+    distance = ndimage.distance_transform_edt(~(hit & seen))
+    # The edge of the mask's pixels lies half a pixel outside their centres.
+    return np.asarray(distance <= margin + 0.5, np.float32), area
+
+
+def unfold_environment(
+    photo: Photo, rig: Rig, ball: Ball, height: int = 128, samples: int = 4
+) -> tuple[Array, Array]:
+    """The environment as the ball shows it: radiance (H, 2H, 3) and coverage (H, 2H) in [0, 1].
+
+    Each texel averages samples² directions; for each the point of the ball that mirrors it into
+    the camera is found and the photo looked up there. Coverage is the share of a texel that is
+    above the horizon and not behind the screen; radiance is the mean over that share. The mirror's
+    reflectance is divided out.
+    """
+    mask, (rows, columns) = screen_mask(rig, ball, SCREEN_MARGIN)
+    origin = (rows.start, columns.start)
+    half = height // 2
+    v = (np.arange(half * samples) + 0.5) / (samples * height)
+    u = (np.arange(2 * height * samples) + 0.5) / (2 * samples * height)
+    wanted = directions(height, v, u)
+    centre = np.asarray(ball.position)
+    normal = mirror_normals(rig, centre, ball.radius_m, wanted, False)
+    pixels = rig.project(centre + ball.radius_m * normal, *ball.size)
+    free = sample_image(mask, pixels, origin) < 0.01
+    light = sample_image(photo.image[rows, columns], pixels, origin) * free[..., None]
+
+    def pool(a: Array) -> Array:
+        return a.reshape(half, samples, 2 * height, samples, -1).sum((1, 3))
+
+    count = pool(free.astype(np.float32))
+    environment = np.zeros((height, 2 * height, 3), np.float32)
+    coverage = np.zeros((height, 2 * height), np.float32)
+    environment[:half] = pool(light) / np.maximum(count, 1) / np.asarray(rig.ball_reflectance)
+    coverage[:half] = count[..., 0] / samples**2
+    return environment, coverage
+
+
+def fill_environment(environment: Array, coverage: Array) -> Array:
+    """Fill the upper hemisphere where coverage is nil, smoothly from what surrounds the gap.
+
+    Harmonic on the sphere (Laplace's equation with the seen texels as its boundary), in the
+    logarithm of the radiance, so that a lamp beside the screen does not spread behind it. The lower
+    hemisphere is left as it is.
+    """
+    height, width = coverage.shape
+    half = height // 2
+    hole = coverage[:half] <= 0
+    if not hole.any():
+        return environment
+    if hole.all():
+        raise InputError("the mirror ball shows nothing but the screen: check the rig's sizes")
+    known = environment[:half][~hole]
+    floor = np.maximum(known.mean(0) * 1e-3, 1e-9)
+    log = np.log(np.maximum(environment[:half], floor)).reshape(-1, 3).astype(np.float64)
+    index = np.full(half * width, -1)
+    unknown = np.flatnonzero(hole.reshape(-1))
+    index[unknown] = np.arange(unknown.size)
+    r, c = np.divmod(unknown, width)
+    # Conductances of the grid's edges: length of the shared side over distance of the centres.
+    sine = np.sin(np.pi * (np.arange(half) + 0.5) / height)
+    side_up = np.sin(np.pi * np.arange(half + 1) / height)
+    step_u, step_v = 2 * np.pi / width, np.pi / height
+    neighbours = [
+        (r, (c - 1) % width, step_v / (step_u * sine[r])),
+        (r, (c + 1) % width, step_v / (step_u * sine[r])),
+        (r - 1, c, side_up[r] * step_u / step_v),  # nought at the zenith
+        (r + 1, c, np.where(r + 1 < half, side_up[r + 1] * step_u / step_v, 0)),
+    ]
+    diagonal = np.zeros(unknown.size)
+    right = np.zeros((unknown.size, 3))
+    triples = []
+    here = np.arange(unknown.size)
+    for nr, nc, weight in neighbours:
+        flat = np.clip(nr, 0, half - 1) * width + nc
+        diagonal += weight
+        other = index[flat]
+        inside = other >= 0
+        triples.append((here[inside], other[inside], -weight[inside]))
+        np.add.at(right, here[~inside], weight[~inside, None] * log[flat[~inside]])
+    triples.append((here, here, diagonal))
+    i, j, value = (np.concatenate(part) for part in zip(*triples, strict=True))
+    matrix = sparse.csc_matrix((value, (i, j)), shape=(unknown.size,) * 2)
+    solution = spsolve(matrix, right)
+    filled = environment.copy()
+    filled[:half].reshape(-1, 3)[unknown] = np.exp(solution)
+    return filled
+
+
+def unfold_pattern(photo: Photo, rig: Rig, ball: Ball, size: int = 256, samples: int = 1) -> Array:
+    """The screen as the ball shows it, (size, size, 3) radiance, row 0 at +y, column 0 at -x.
+
+    For each point of the screen the point of the ball that mirrors it into the camera, near field.
+    """
+    rows, columns = window(ball)
+    n = size * samples
+    s = (np.arange(n) + 0.5) / n
+    e_x, e_y = rig.screen_edges
+    target = rig.screen_corner + s[None, :, None] * e_x + (1 - s)[:, None, None] * e_y
+    centre = np.asarray(ball.position)
+    normal = mirror_normals(rig, centre, ball.radius_m, target, True)
+    pixels = rig.project(centre + ball.radius_m * normal, *ball.size)
+    light = sample_image(photo.image[rows, columns], pixels, (rows.start, columns.start))
+    light = light.reshape(size, samples, size, samples, 3).mean((1, 3))
+    return (light / np.asarray(rig.ball_reflectance)).astype(np.float32)
+
+
+def screen_lookup(
+    rig: Rig, ball: Ball, shape: tuple[int, int], samples: int = 4
+) -> tuple[NDArray[np.intp], Mask, tuple[slice, slice]]:
+    """Which pixel of a pattern of that shape each sub-pixel of the ball's image sees.
+
+    Returns flat indices (H·samples, W·samples) into the pattern, a mask of those that see the
+    screen at all, and the window of the photo they cover.
+    """
+    rows, columns = area = window(ball)
+    point, mirrored, seen = trace_ball(rig, ball, pixel_grid(rows, columns, samples))
+    s, t, hit = screen_coordinates(rig, point, mirrored)
+    hit &= seen
+    h, w = shape
+    column = np.clip((np.where(hit, s, 0) * w).astype(int), 0, w - 1)
+    row = np.clip(((1 - np.where(hit, t, 0)) * h).astype(int), 0, h - 1)
+    return row * w + column, hit, area
+
+
+def predict_pattern(pattern: Array, lookup: NDArray[np.intp], hit: Mask, blur: float) -> Array:
+    """What the ball's image shows of a pattern (h, w, 3): (H, W, 4), the last the screen's share.
+
+    ``lookup`` and ``hit`` come from `screen_lookup` with four samples; each pixel averages its own,
+    after a Gaussian point spread with a standard deviation of ``blur`` pixels.
+    """
+    out = np.concatenate([pattern.reshape(-1, 3)[lookup], np.ones((*hit.shape, 1))], -1)
+    out = (out * hit[..., None]).astype(np.float32)
+    if blur > 0.05:
+        out = ndimage.gaussian_filter(out, (4 * blur, 4 * blur, 0), truncate=3)
+    height, width = hit.shape
+    return np.asarray(out.reshape(height // 4, 4, width // 4, 4, 4).mean((1, 3)))
