@@ -80,9 +80,9 @@ def material_statistics(maps: Maps) -> dict[str, float]:
     }
     return {
         "diffuse mean": float(diffuse.mean()),
-        "diffuse std": float(diffuse.std()),
+        "diffuse std": round(float(diffuse.std()), 6),
         "specular mean": float(specular.mean()),
-        "specular std": float(specular.std()),
+        "specular std": round(float(specular.std()), 6),
         "roughness mean": float(maps.roughness.mean()),
         "roughness std": float(maps.roughness.std()),
         "tilt median": float(np.median(tilt)),

@@ -66,11 +66,11 @@ def find_ball(photo: Photo, rig: Rig, manual: tuple[float, float, float] | None 
     view = _view(photo, middle, (SEARCH + 1.5) * expected.radius, expected.radius / 48)
     starts = []
     for start in _coarse(view, rig, expected):
-        theta = _climb(view, rig, start, 2, 0.08, 30)
+        theta = _climb(view, rig, start, 2, 0.08, 25)
         starts.append((_score(view, rig, theta, 64, 1)[0], theta))
     starts.sort(key=lambda pair: -pair[0])
     best, theta = -math.inf, np.zeros(3)
-    for _, start in starts[:3]:
+    for _, start in starts[:2]:
         candidate = _climb(view, rig, _climb(view, rig, start, 1, 0.04, 40), 0, 0.02, 40)
         score = _score(view, rig, candidate)[0]
         if score > best:
@@ -263,7 +263,7 @@ def _look(levels: Array, level: Array, at: Array) -> Array:
     return np.asarray(top * (1 - fy) + bottom * fy)
 
 
-def _coarse(view: _View, rig: Rig, expected: Ball, keep: int = 10) -> list[Array]:
+def _coarse(view: _View, rig: Rig, expected: Ball, keep: int = 8) -> list[Array]:
     """The best few (x, y, radius) on the table, by scoring every pixel of the view."""
     trace = view.tensor[..., 0] + view.tensor[..., 2] + 3 * view.noise
     # Every second pixel will do: the curves of a ball of 48 pixels are that blurred anyway.
@@ -411,8 +411,8 @@ def _confidence(view: _View, rig: Rig, theta: Array) -> float:
 
     The weights were fitted to simulated photos with and without a ball.
     """
-    weights = np.array([2.13, 0.67, 1.03, -6.08, 4.27, 11.58])
-    return float(1 / (1 + math.exp(3.43 - _features(view, rig, theta) @ weights)))
+    weights = np.array([2.63, 2.79, 2.76, -9.88, -0.19, 13.73])
+    return float(1 / (1 + math.exp(5.72 - _features(view, rig, theta) @ weights)))
 
 
 _RING = _ring()

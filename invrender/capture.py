@@ -123,7 +123,7 @@ def _find_pattern(folder: Path) -> str:
     raise InputError(f"{folder} has no pattern: set [pattern] image in rig.toml")
 
 
-def crop_sample(photo: Photo, rig: Rig, size: int = 256, order: int = 3) -> Array:
+def crop_sample(photo: Photo, rig: Rig, size: int = 256) -> Array:
     """The sample's square of the photo as (size, size, 3) radiance, row 0 at +y.
 
     Each pixel is the mean over its square of the sample when the photo is finer than the crop, and
@@ -146,6 +146,7 @@ def crop_sample(photo: Photo, rig: Rig, size: int = 256, order: int = 3) -> Arra
     crop = photo.image[y0:y1, x0:x1]
     scale = float((high - low).max()) / size  # photo pixels in one of the crop's
     samples = max(1, math.ceil(scale))
+    order = 3 if scale < 2 else 1  # the mean over many pixels needs no splines
     pixels = rig.project(rig.sample_points(size * samples, size * samples), h, w)
     at = np.stack([pixels[..., 1] - y0 - 0.5, pixels[..., 0] - x0 - 0.5])
     planes = []
@@ -163,20 +164,21 @@ def fit_gain(photo: Photo, rig: Rig, ball: Ball, pattern: Array) -> tuple[Array,
     reweighted least squares, Huber); saturated pixels are left out. ``fit`` as in `Lights`. Raises
     `InputError` if the ball does not show the screen, or shows it dark.
     """
-    lookup, hit, (rows, columns) = screen_lookup(rig, ball, pattern.shape[:2])
+    n = 4 if ball.radius < 80 else 2
+    lookup, hit, (rows, columns) = screen_lookup(rig, ball, pattern.shape[:2], n)
     # Only the part of the window that shows the screen, and around it what blurs into it.
     inside = np.argwhere(hit)
     if len(inside) == 0:
         raise InputError("the ball cannot show the screen: check the rig's sizes")
-    low = np.maximum(inside.min(0) // 4 - 4, 0)
-    high = inside.max(0) // 4 + 5
-    part = slice(4 * low[0], 4 * high[0]), slice(4 * low[1], 4 * high[1])
+    low = np.maximum(inside.min(0) // n - 4, 0)
+    high = inside.max(0) // n + 5
+    part = slice(n * low[0], n * high[0]), slice(n * low[1], n * high[1])
     lookup, hit = lookup[part], hit[part]
     rows = slice(rows.start + low[0], min(rows.start + high[0], rows.stop))
     columns = slice(columns.start + low[1], min(columns.start + high[1], columns.stop))
     captured = photo.image[rows, columns] / np.asarray(rig.ball_reflectance)
     # Pixels that see nothing but the screen, and whose neighbours do.
-    whole = predict_pattern(pattern, lookup, hit, 0)[..., 3] > 0.999
+    whole = predict_pattern(pattern, lookup, hit, 0, n)[..., 3] > 0.999
     use = ndimage.binary_erosion(whole) & ~photo.clipped[rows, columns]
     if use.sum() < 12:
         raise InputError(
@@ -185,7 +187,7 @@ def fit_gain(photo: Photo, rig: Rig, ball: Ball, pattern: Array) -> tuple[Array,
     values = captured[use].astype(float)
 
     def solve(blur: float, gamma: float) -> tuple[float, Array]:
-        predicted = predict_pattern(pattern**gamma, lookup, hit, blur)[use][:, :3].astype(float)
+        predicted = predict_pattern(pattern**gamma, lookup, hit, blur, n)[use][:, :3].astype(float)
         gain = np.zeros(3)
         squares = 0.0
         for c in range(3):

@@ -87,10 +87,10 @@ def read_maps(folder: Path) -> Maps:
     )
 
 
-def write_maps(folder: Path, maps: Maps) -> None:
+def write_maps(folder: Path, maps: Maps, *, half: bool = False) -> None:
     """Write the four EXR files into a folder."""
     for name, image in maps.encoded().items():
-        write_exr(Path(folder) / f"{name}.exr", image)
+        write_exr(Path(folder) / f"{name}.exr", image, half=half)
 
 
 def map_errors(maps: Maps, truth: Maps) -> dict[str, float]:

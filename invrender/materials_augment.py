@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
+from scipy.sparse import csr_array
 
 from invrender.errors import InputError
 from invrender.maps import NAMES, Maps
@@ -18,23 +19,31 @@ Array = NDArray[np.floating[Any]]
 def resize(image: Array, height: int, width: int) -> Array:
     """Resize (H, W) or (H, W, C): the mean over each new pixel's area, linear when enlarging."""
     result = np.asarray(image, np.float32)
-    if result.shape[0] != height:
-        result = np.tensordot(_weights(result.shape[0], height), result, (1, 0))
-    if result.shape[1] != width:
-        result = np.tensordot(_weights(result.shape[1], width), result, (1, 1))
-        result = np.ascontiguousarray(np.swapaxes(result, 0, 1))
-    return result
+    for axis, size in enumerate((height, width)):
+        if result.shape[axis] != size:
+            moved = np.ascontiguousarray(np.swapaxes(result, 0, axis))
+            new = _weights(moved.shape[0], size) @ moved.reshape(moved.shape[0], -1)
+            result = np.swapaxes(new.reshape(size, *moved.shape[1:]), 0, axis)
+    return np.ascontiguousarray(result)
 
 
-def _weights(old: int, new: int) -> Array:
+def _weights(old: int, new: int) -> csr_array:
+    """Weights (new, old) of old pixels in new ones. Sparse: no BLAS threads to fight others'."""
     edges = np.linspace(0, old, new + 1)
     if new <= old:
-        i = np.arange(old)
-        overlap = np.minimum(edges[1:, None], i + 1) - np.maximum(edges[:-1, None], i)
-        return (np.maximum(overlap, 0) / (old / new)).astype(np.float32)
-    centre = (edges[:-1] + edges[1:]) / 2 - 0.5
-    distance = np.abs(np.clip(centre, 0, old - 1)[:, None] - np.arange(old))
-    return np.maximum(1 - distance, 0).astype(np.float32)
+        first = np.floor(edges[:-1]).astype(np.intp)
+        column = first[:, None] + np.arange(int(np.ceil(old / new)) + 1)
+        overlap = np.minimum(edges[1:, None], column + 1) - np.maximum(edges[:-1, None], column)
+        weight = np.maximum(overlap, 0) / (old / new)
+        column = np.minimum(column, old - 1)
+    else:
+        centre = np.clip((edges[:-1] + edges[1:]) / 2 - 0.5, 0, old - 1)
+        first = np.minimum(centre.astype(np.intp), max(old - 2, 0))
+        column = np.minimum(first[:, None] + np.arange(2), old - 1)
+        weight = np.stack([1 - (centre - first), centre - first], -1)
+    start = np.arange(new + 1) * column.shape[1]
+    values = weight.astype(np.float32).ravel()
+    return csr_array((values, column.ravel(), start), shape=(new, old))
 
 
 def _unit(normal: Array) -> Array:

@@ -167,7 +167,7 @@ def _hollows(
     canvas: Canvas, rng: np.random.Generator, base: Array, rough: Array, height: Array
 ) -> tuple[Array, Array]:
     """Dirt in the hollows and polish on the crests, on most materials: base and roughness."""
-    dark, dull = uniform(rng, -0.1, 0.6), uniform(rng, -0.06, 0.1)
+    dark, dull = uniform(rng, -0.1, 0.8), uniform(rng, -0.1, 0.2)
     if chance(rng, 0.3):
         return base, rough
     around = uniform_filter(height, max(3, round(canvas.scale / 18)), mode="reflect")

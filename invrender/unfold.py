@@ -229,15 +229,19 @@ def screen_lookup(
     return row * w + column, hit, area
 
 
-def predict_pattern(pattern: Array, lookup: NDArray[np.intp], hit: Mask, blur: float) -> Array:
+def predict_pattern(
+    pattern: Array, lookup: NDArray[np.intp], hit: Mask, blur: float, samples: int = 4
+) -> Array:
     """What the ball's image shows of a pattern (h, w, 3): (H, W, 4), the last the screen's share.
 
-    ``lookup`` and ``hit`` come from `screen_lookup` with four samples; each pixel averages its own,
-    after a Gaussian point spread with a standard deviation of ``blur`` pixels.
+    ``lookup`` and ``hit`` come from `screen_lookup` with as many ``samples``; each pixel averages
+    its own, after a Gaussian point spread with a standard deviation of ``blur`` pixels.
     """
     out = np.concatenate([pattern.reshape(-1, 3)[lookup], np.ones((*hit.shape, 1))], -1)
     out = (out * hit[..., None]).astype(np.float32)
     if blur > 0.05:
-        out = ndimage.gaussian_filter(out, (4 * blur, 4 * blur, 0), truncate=3)
+        out = ndimage.gaussian_filter(out, (samples * blur, samples * blur, 0), truncate=3)
     height, width = hit.shape
-    return np.asarray(out.reshape(height // 4, 4, width // 4, 4, 4).mean((1, 3)))
+    return np.asarray(
+        out.reshape(height // samples, samples, width // samples, samples, 4).mean((1, 3))
+    )

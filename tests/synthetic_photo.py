@@ -121,7 +121,7 @@ def photograph(
     image = block(0, height, 0, width, 1)
     if ball is not None:
         x, y = rig.project(centre, height, width)
-        r = rig.focal(width) * rig.ball_radius / rig.screen_height * 1.2 + 3
+        r = rig.focal(width) * rig.ball_radius / rig.screen_height * 2.5 + 3
         y0, y1 = max(0, int(y - r)), min(height, int(y + r))
         x0, x1 = max(0, int(x - r)), min(width, int(x + r))
         if y1 > y0 and x1 > x0:

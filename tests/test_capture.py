@@ -193,7 +193,7 @@ def test_environment_round_trip(lights):
     full = (seen > 0.99) & (directions(height)[..., 2] > 0.1)
     assert full.mean() > 0.3
     error = lights.environment[full] - truth[full]
-    assert np.sqrt(np.mean(error**2)) / truth[full].mean() < 0.03
+    assert np.sqrt(np.mean(error**2)) / truth[full].mean() < 0.05
     upper = directions(height)[..., 2] > 0
     e, t = plane_irradiance(lights.environment, upper), plane_irradiance(truth, upper)
     np.testing.assert_allclose(e, t, rtol=0.05)
@@ -205,7 +205,7 @@ def test_small_lamp_keeps_its_energy():
         on = d @ (np.array([0.5, 0.6, 0.62]) / np.linalg.norm([0.5, 0.6, 0.62])) > np.cos(0.03)
         return np.where(on[..., None], 800.0, 0.1) * np.ones(3)
 
-    image = photograph(RIG, *SIZE, environment=lamp, samples=8)
+    image = photograph(RIG, *SIZE, environment=lamp, samples=5)
     got = extract_lights(Capture(Photo(image), RIG, PATTERN), true_ball())
     height = got.environment.shape[0]
     fine = lamp(directions(1024)).reshape(height, 1024 // height, 2 * height, 1024 // height, 3)
