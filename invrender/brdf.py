@@ -17,6 +17,8 @@ from typing import Any
 
 from invrender.backend import dr
 
+MIN_VIEW = 1e-4  # the least n·v: normals that face away from the viewer are seen at this angle
+
 
 def frame(n: Any) -> tuple[Any, Any]:
     """Tangents s, t such that (s, t, n) is orthonormal and right-handed, smooth for n_z > -1.
@@ -32,6 +34,12 @@ def frame(n: Any) -> tuple[Any, Any]:
 def to_local(d: Any, s: Any, t: Any, n: Any) -> Any:
     """World direction to the frame (s, t, n)."""
     return type(d)(dr.dot(d, s), dr.dot(d, t), dr.dot(d, n))
+
+
+def to_viewer(d: Any, s: Any, t: Any, n: Any) -> Any:
+    """`to_local` for the direction to the viewer: a normal that faces away shows its horizon."""
+    v = to_local(d, s, t, n)
+    return dr.normalize(type(d)(v.x, v.y, dr.maximum(v.z, MIN_VIEW)))
 
 
 def to_world(d: Any, s: Any, t: Any, n: Any) -> Any:

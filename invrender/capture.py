@@ -17,11 +17,9 @@ from invrender.maps import Maps, read_maps
 from invrender.mirror import Ball
 from invrender.rig import Rig, read_rig
 from invrender.unfold import (
-    directions,
     fill_environment,
     predict_pattern,
     screen_lookup,
-    solid_angles,
     unfold_environment,
     unfold_pattern,
 )
@@ -228,15 +226,3 @@ def extract_lights(capture: Capture, ball: Ball, height: int = 128) -> Lights:
     gain, fit = fit_gain(photo, rig, ball, capture.pattern)
     captured = unfold_pattern(photo, rig, ball, min(256, max(capture.pattern.shape[:2])))
     return Lights(environment, coverage, capture.pattern, gain, captured, fit)
-
-
-def plane_irradiance(environment: Array, weight: Array | None = None) -> Array:
-    """Irradiance (3,) on the plane z = 0: ∫ L cos θ dω over the upper hemisphere.
-
-    ``weight`` (H, 2H), if given, multiplies the radiance (a visibility, say).
-    """
-    height = environment.shape[0]
-    cosine = np.maximum(directions(height)[..., 2], 0) * solid_angles(height)[:, None]
-    if weight is not None:
-        cosine = cosine * weight
-    return np.asarray((environment * cosine[..., None]).sum((0, 1)))

@@ -1,34 +1,35 @@
 """The fast estimator: few filtered samples, no noise in the diffuse term.
 
 Diffuse light comes from tables of irradiance; specular light from visible-normal samples whose
-look-ups are filtered to each sample's share of the lobe; lamps are summed one by one. Everything is
-smooth in the maps and the pose: the screen's edge is as soft as the sample's footprint. The bias is
-that of the footprints and goes to zero as samples grow.
+look-ups are filtered to each sample's share of the lobe; lamps are summed one by one where lobes
+are wider than they are. Everything is smooth in the maps and the pose: the screen's edge is as soft
+as the sample's footprint. The bias is that of the footprints and falls as samples grow.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 from invrender import brdf
 from invrender.backend import dr, vector
-from invrender.scene import Scene, View, hit_screen, unit
-from invrender.shading import Shading, Sums
+from invrender.pyramid import disc
+from invrender.scene import Scene, ScreenFrame, View, screen_frame, unit
+from invrender.shading import Shading, Sums, with_tangents
 from invrender.tables import (
-    LAMP_SIDES,
     Tables,
-    lamp_point,
-    screen_at,
+    lamp_at,
+    lamp_side,
     screen_cell,
-    sky_at,
+    screen_level,
     sky_irradiance_at,
+    sky_level,
     vector_irradiance_at,
 )
 
 SCREEN_BIAS, SKY_BIAS = 0.0, -0.5  # levels added to a look-up whose footprint is a sample's share
-
 STEEP_SIDE = 16  # screen cells a side where a normal's horizon cuts the screen
-# screen cells a side where a normal's horizon cuts the screen
+WIDE = 1.0  # a sample's share of the lobe, in lamps, from which lamps are summed one by one
 
 
 def shade_fast(
@@ -41,45 +42,104 @@ def shade_fast(
     uint, vec3 = dr.uint32_array_t(scalar), vector(scalar, 3)
     width = max(dr.width(view.x), dr.width(rho), dr.width(normal))
     sums = Sums(vec3, width, jacobian)
-    sums.add(lambda r, m: (_smooth_irradiance(tables, view, m),), (0,), rho, normal)
-    if tables.screen is not None:
+    screen = screen_frame(scene, view.x) if tables.screen is not None else None
+    s, t = brdf.frame(normal)
+
+    def along_normal(light: Any, d: Any, sign: int = 1) -> list[list[Any]]:
+        """Rows of light · max(±n·d, 0)."""
+        cos = sign * dr.dot(normal, d)
+        rows = [light * dr.maximum(cos, 0)]
+        if jacobian:
+            light = light * dr.select(cos > 0, scalar(sign), 0)
+            rows += [vec3(0), light * dr.dot(s, d), light * dr.dot(t, d)]
+        return [[r] for r in rows]
+
+    sums.add(sums.derive(lambda _, n: (_smooth_irradiance(tables, view, n),), rho, normal), (0,))
+    if screen is not None:
         cells = dr.select(_is_steep(scene, view, normal), uint(STEEP_SIDE**2), uint(0))
-        steep = lambda i, r, m: (_steep_sample(tables, view, i, m),)  # noqa: E731
-        sums.run(dr.detach(cells), steep, (0,), "steep", rho, normal)
-    if tables.screen is not None or tables.sky is not None:
-        n_samples = dr.opaque(uint, samples)
-        inv_n = 1 / scalar(n_samples)
-        lobe = lambda i, r, m: _specular_sample(tables, view, i, inv_n, r * r, m)  # noqa: E731
-        sums.run(n_samples, lobe, (1, 2), "specular", rho, normal)
+
+        def steep(i: Any) -> list[list[Any]]:
+            d, omega, light = screen_cell(tables, view.x, i, STEEP_SIDE)
+            return along_normal(light * omega, d, -1)
+
+        sums.run(dr.detach(cells), steep, (0,), "steep")
+
+    n_samples = dr.opaque(uint, samples)
+    wide = None
     if tables.lamp_count:
-        # Points a side in each lamp: more where the lobe is narrower than the lamp.
         texel = dr.pi / scene.env_height
-        side = dr.clip(dr.ceil(0.75 * texel / dr.maximum(rho * rho, 1e-6)), 1, LAMP_SIDES[-1])
-        side = dr.detach(uint(side))
-        first = dr.zeros(uint, width)
-        for stop, occluded in ((tables.lamp_open, False), (tables.lamp_count, True)):
-            last = side * side * dr.opaque(uint, stop)
-            if stop and not (occluded and stop == tables.lamp_open):
-                lamp = lambda i, r, m, occluded=occluded: _lamp_sample(  # noqa: E731
-                    tables, view, i, side, r * r, m, occluded
-                )
-                sums.run(last, lamp, (0, 1, 2), "lamps", rho, normal, start=first)
-            first = last
+        alpha = dr.detach(rho * rho)
+        wide = alpha * alpha * (4 * dr.pi) > scalar(n_samples) * (WIDE * texel * texel)
+        side = lamp_side(n_samples)
+        stop = side * side * dr.opaque(uint, tables.lamp_count)
+
+        def lamp_irradiance(i: Any) -> list[list[Any]]:
+            d, light = lamp_at(tables, screen, i, side)
+            return along_normal(light, d)
+
+        def lamp_lobe(i: Any) -> list[list[Any]]:
+            d, light = lamp_at(tables, screen, i, side)
+            rows = sums.derive(lambda r, n: _lobe(view, r * r, n, d), rho, normal)
+            return [[light * x for x in row] for row in rows]
+
+        sums.run(stop, lamp_irradiance, (0,), "lamp irradiance")
+        sums.run(dr.select(wide, stop, 0), lamp_lobe, (1, 2), "lamp lobes")
+    if tables.screen is not None or tables.sky is not None:
+        inv_n = 1 / scalar(n_samples)
+
+        def specular(i: Any) -> list[list[Any]]:
+            f = lambda r, n: _sample(tables, screen, view, i, inv_n, r * r, n).flat()  # noqa: E731
+            if not jacobian:
+                return [_specular(tables, _Sample.of(tables, f(rho, normal)), wide)]
+            values, tangents = with_tangents(f, rho, normal)
+            return _specular_rows(
+                tables, _Sample.of(tables, values), [_Sample.of(tables, t) for t in tangents], wide
+            )
+
+        sums.run(n_samples, specular, (1, 2), "specular", inv_n)
     return sums.shading()
 
 
-def _specular_sample(
-    tables: Tables, view: View, i: Any, inv_n: Any, alpha: Any, n: Any
-) -> tuple[Any, Any]:
+@dataclass
+class _Sample:
+    """A sample of the specular lobe: what is looked up where, or a derivative of that.
+
+    weight: G2/G1, or zero where nothing is reflected. screen: (s, 1 - t, level). sky: (x, y, level)
+    on the disc's square.
+    """
+
+    weight: Any
+    fresnel: Any
+    screen: list[Any]
+    sky: list[Any]
+
+    def flat(self) -> tuple[Any, ...]:
+        return (self.weight, self.fresnel, *self.screen, *self.sky)
+
+    @staticmethod
+    def of(tables: Tables, flat: Any) -> _Sample:
+        """Inverse of `flat`."""
+        weight, fresnel, *rest = flat
+        n = 3 if tables.screen is not None else 0
+        return _Sample(weight, fresnel, list(rest[:n]), list(rest[n:]))
+
+
+def _sample(
+    tables: Tables,
+    screen: ScreenFrame | None,
+    view: View,
+    i: Any,
+    inv_n: Any,
+    alpha: Any,
+    n: Any,
+) -> _Sample:
     """Sample i of N of the specular integral, filtered to its share 1/(N·pdf) of the lobe.
 
-    Returns its terms of B and A. Smooth in α and n: directions move with the parameters.
+    Smooth in α and n: directions move with the parameters.
     """
     scalar = type(alpha)
-    vec3 = vector(scalar, 3)
     s, t = brdf.frame(n)
-    v = brdf.to_local(view.to_camera, s, t, n)
-    v.z = dr.maximum(v.z, 1e-4)  # normals that face away from the camera show their horizon
+    v = brdf.to_viewer(view.to_camera, s, t, n)
     # Rank-1 lattice (golden ratio) with a random rotation a pixel.
     u1 = unit(i * 2654435769 + view.hash, scalar)
     u2 = dr.fma(scalar(i), inv_n, 0.5 * inv_n)
@@ -87,7 +147,7 @@ def _specular_sample(
     v_h = dr.dot(v, h)
     local = dr.fma(h, 2 * v_h, -v)
     d = brdf.to_world(local, s, t, n)
-    valid = (local.z > 1e-6) & (d.z > -0.2)
+    valid = (local.z > 0) & (d.z > -0.2)
     lz = dr.select(valid, local.z, 1)
     a2 = alpha * alpha
     root_l = dr.sqrt(dr.fma(a2, local.x * local.x + local.y * local.y, lz * lz))
@@ -95,56 +155,97 @@ def _specular_sample(
     weight = lz * (v.z + root_v) / dr.fma(v.z, root_l, lz * root_v)  # G2 / G1(v)
     pdf = brdf.ggx_d(h, alpha) / (2 * (v.z + root_v))
     omega = dr.minimum(inv_n / pdf, 2 * dr.pi)
-    radiance = vec3(0)
-    cover = None
-    if tables.screen is not None:
-        ps, pt, r, cos, _ = hit_screen(tables.scene, view.x, d)
-        ahead = cos > 1e-3
-        cos = dr.select(ahead, cos, 1)
-        size = dr.norm(dr.cross(tables.scene.edge_x, tables.scene.edge_y))
-        rgba = screen_at(tables, ps, pt, omega * r * r / (cos * size), SCREEN_BIAS)
-        rgba = dr.select(ahead, rgba, 0)
-        radiance = vec3(rgba.x, rgba.y, rgba.z)
-        cover = rgba.w
+    on_screen, on_sky = [], []
+    if screen is not None:
+        ps, pt, r, cos, ahead = screen.hit(d)
+        area = omega * r * r / (dr.select(ahead, cos, 1) * screen.area)
+        # What does not meet the plane reads far outside.
+        on_screen = [
+            dr.select(ahead, ps, -8),
+            dr.select(ahead, 1 - pt, -8),
+            screen_level(tables, area) + SCREEN_BIAS,
+        ]
     if tables.sky is not None:
-        rgba = sky_at(tables, d, omega, SKY_BIAS)
-        open_share = 1 if cover is None else 1 - cover
-        open_share = open_share / dr.maximum(rgba.w, 0.02)
-        radiance = radiance + vec3(rgba.x, rgba.y, rgba.z) * open_share
-    radiance = radiance * dr.select(valid, weight * inv_n, 0)
-    fresnel = brdf.schlick(v_h)
-    return radiance * (1 - fresnel), radiance * fresnel
+        x, y = disc(d)
+        level = sky_level(tables, omega) + SKY_BIAS
+        on_sky = [dr.fma(x, 0.5, 0.5), dr.fma(y, -0.5, 0.5), level]
+    return _Sample(dr.select(valid, weight, 0), brdf.schlick(v_h), on_screen, on_sky)
 
 
-def _lamp_sample(
-    tables: Tables, view: View, i: Any, side: Any, alpha: Any, n: Any, occluded: bool
-) -> tuple[Any, Any, Any]:
-    """Point i of the lamps' side² each. Returns its terms of E, B and A."""
-    scene = tables.scene
-    d, solid_angle, light = lamp_point(tables, i, side)
-    light = light * dr.select(d.z > 0, solid_angle, 0)
-    if occluded:
-        # A point stands for its solid angle: the screen's edge hides it bit by bit.
-        ps, pt, r, cos, _ = hit_screen(scene, view.x, d)
-        ahead = cos > 1e-3
-        size = dr.norm(dr.cross(scene.edge_x, scene.edge_y))
-        width = r * dr.sqrt(solid_angle / (dr.select(ahead, cos, 1) * size)) + 1e-6
-        light *= 1 - dr.select(ahead, _inside(ps, width) * _inside(pt, width), 0)
+MIN_COVER = 0.02  # of a sky footprint that the screen does not always hide
+
+
+def _base(tables: Tables, wide: Any) -> Any:
+    """Where the sky pyramid starts: with lamps for narrow lobes, without for wide ones."""
+    assert tables.sky is not None
+    if wide is None:
+        return 0
+    uint = dr.uint32_array_t(tables.scene.scalar)
+    return dr.select(wide, uint(0), uint(tables.sky.size))
+
+
+def _rgb(v: Any) -> Any:
+    return vector(type(v.x), 3)(v.x, v.y, v.z)
+
+
+def _specular(tables: Tables, sample: _Sample, wide: Any) -> list[Any]:
+    """Terms of B and A."""
+    light: Any = 0
+    share: Any = 1
+    if tables.screen is not None:
+        rgba = tables.screen(*sample.screen)
+        light, share = _rgb(rgba), 1 - rgba.w
+    if tables.sky is not None:
+        rgba = tables.sky(*sample.sky, _base(tables, wide))
+        light = light + _rgb(rgba) * (share / dr.maximum(rgba.w, MIN_COVER))
+    light = light * sample.weight
+    return [light * (1 - sample.fresnel), light * sample.fresnel]
+
+
+def _specular_rows(
+    tables: Tables, sample: _Sample, tangents: list[_Sample], wide: Any
+) -> list[list[Any]]:
+    """`_specular` and its tangents by the chain rule: one set of texels serves all of them."""
+
+    def chain(slopes: list[Any], t: list[Any]) -> Any:
+        return slopes[0] * t[0] + slopes[1] * t[1] + slopes[2] * t[2]
+
+    light: Any = 0
+    share: Any = 1
+    d_light: list[Any] = [0] * 3
+    d_share: list[Any] = [0] * 3
+    if tables.screen is not None:
+        rgba, *slopes = tables.screen.slopes(*sample.screen)
+        light, share = _rgb(rgba), 1 - rgba.w
+        for k, t in enumerate(tangents):
+            d = chain(slopes, t.screen)
+            d_light[k], d_share[k] = _rgb(d), -d.w
+    if tables.sky is not None:
+        rgba, *slopes = tables.sky.slopes(*sample.sky, _base(tables, wide))
+        inverse = 1 / dr.maximum(rgba.w, MIN_COVER)
+        sky, share = _rgb(rgba), share * inverse
+        light = light + sky * share
+        for k, t in enumerate(tangents):
+            d = chain(slopes, t.sky)
+            change = dr.select(rgba.w > MIN_COVER, d.w, 0) * share
+            d_light[k] = d_light[k] + _rgb(d) * share + sky * ((d_share[k] - change) * inverse)
+    rows = [
+        [light * (sample.weight * (1 - sample.fresnel)), light * (sample.weight * sample.fresnel)]
+    ]
+    for k, t in enumerate(tangents):
+        slope = d_light[k] * sample.weight + light * t.weight
+        bent = light * (sample.weight * t.fresnel)
+        f = sample.fresnel
+        rows.append([slope * (1 - f) - bent, slope * f + bent])
+    return rows
+
+
+def _lobe(view: View, alpha: Any, n: Any, d: Any) -> tuple[Any, Any]:
+    """Factors of B and A of light from direction d."""
     s, t = brdf.frame(n)
     local = brdf.to_local(d, s, t, n)
-    v = brdf.to_local(view.to_camera, s, t, n)
-    v.z = dr.maximum(v.z, 1e-4)
-    value, fresnel = brdf.specular(local, v, alpha)
-    return (
-        light * dr.maximum(local.z, 0),
-        light * (value * (1 - fresnel)),
-        light * (value * fresnel),
-    )
-
-
-def _inside(s: Any, width: Any) -> Any:
-    """Share of [s - w/2, s + w/2] in [0, 1]."""
-    return (dr.clip(dr.fma(width, 0.5, s), 0, 1) - dr.clip(dr.fma(width, -0.5, s), 0, 1)) / width
+    value, fresnel = brdf.specular(local, brdf.to_viewer(view.to_camera, s, t, n), alpha)
+    return value * (1 - fresnel), value * fresnel
 
 
 def _smooth_irradiance(tables: Tables, view: View, n: Any) -> Any:
@@ -156,12 +257,6 @@ def _smooth_irradiance(tables: Tables, view: View, n: Any) -> Any:
         a, b, c = vector_irradiance_at(tables, view.x)
         total = total + a * n.x + b * n.y + c * n.z
     return total
-
-
-def _steep_sample(tables: Tables, view: View, i: Any, n: Any) -> Any:
-    """Screen cell i's correction to E where it lies below the normal's horizon."""
-    d, omega, radiance = screen_cell(tables, view.x, i, STEEP_SIDE)
-    return radiance * (omega * dr.maximum(-dr.dot(n, d), 0))
 
 
 def _is_steep(scene: Scene, view: View, n: Any) -> Any:

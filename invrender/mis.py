@@ -1,4 +1,4 @@
-"""The unbiased estimator: multiple importance sampling of screen, environment and visible normals."""
+"""The unbiased estimator: multiple importance sampling of screen, environment and normals."""
 
 from __future__ import annotations
 
@@ -133,8 +133,7 @@ def shade_mis(
     def lobe(d: Any, rho: Any, n: Any) -> tuple[Any, Any, Any]:
         """Cosine and the two specular terms at direction d."""
         s, t = brdf.frame(n)
-        v = brdf.to_local(view.to_camera, s, t, n)
-        v.z = dr.maximum(v.z, 1e-4)
+        v = brdf.to_viewer(view.to_camera, s, t, n)
         local = brdf.to_local(d, s, t, n)
         value, fresnel = brdf.specular(local, v, rho * rho)
         return dr.maximum(local.z, 0), value * (1 - fresnel), value * fresnel
@@ -186,8 +185,7 @@ def shade_mis(
         rho0, n0 = (dr.detach(rho), dr.detach(n)) if proposal is None else proposal
         alpha = rho0 * rho0
         frame = (*brdf.frame(n0), n0)
-        v = brdf.to_local(to_camera, *frame)
-        v.z = dr.maximum(v.z, 1e-4)
+        v = brdf.to_viewer(to_camera, *frame)
         # Roberts' R2 lattice in 32-bit integers, rotated by random bits a pixel and technique.
         a, b = i * 3242174889, i * 2447445414
         bits = view.hash
@@ -217,5 +215,6 @@ def shade_mis(
     width = max(dr.width(view.x), dr.width(rho), dr.width(normal))
     sums = Sums(vec3, width, jacobian)
     if has_screen or has_env:
-        sums.run(n_samples, sample, (0, 1, 2), "mis", rho, normal, 1 / scalar(n_samples))
+        rows = lambda i: sums.derive(lambda r, n: sample(i, r, n), rho, normal)  # noqa: E731
+        sums.run(n_samples, rows, (0, 1, 2), "mis", 1 / scalar(n_samples))
     return sums.shading()

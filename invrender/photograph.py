@@ -58,8 +58,7 @@ class CookTorrance(mi.BSDF):
     def _setup(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[Any, Any, Any, Any]:
         n = dr.normalize(mi.Vector3f(self._fetch("normal", si, active)))
         s, t = brdf.frame(n)
-        v = brdf.to_local(si.wi, s, t, n)
-        v.z = dr.maximum(v.z, 1e-4)
+        v = brdf.to_viewer(si.wi, s, t, n)
         alpha = dr.square(self._fetch("roughness", si, active))
         return s, t, v, alpha
 

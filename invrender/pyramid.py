@@ -46,33 +46,56 @@ class Pyramid:
                 + dr.gather(vec4, dr.ravel(image), j + 2 * m + 1)
             )
 
-    def _level(self, k: Any, x: Any, y: Any) -> Any:
+    @property
+    def size(self) -> int:
+        """Texels of all levels."""
+        return level_offset(self.n, self.n.bit_length())
+
+    def _level(self, k: Any, x: Any, y: Any, slopes: bool, base: Any) -> list[Any]:
+        """[value] on level k, or [value, ∂/∂x, ∂/∂y]."""
         scalar = type(x)
         uint = dr.uint32_array_t(scalar)
         vec4 = vector(scalar, 4)
         m = uint(self.n) >> k
         mf = scalar(m)
-        px = dr.clip(dr.fma(x, mf, 0.5), 0, mf + 0.999)
-        py = dr.clip(dr.fma(y, mf, 0.5), 0, mf + 0.999)
-        ix, iy = uint(px), uint(py)
-        fx, fy = px - scalar(ix), py - scalar(iy)
+        px, py = dr.fma(x, mf, 0.5), dr.fma(y, mf, 0.5)
+        qx, qy = dr.clip(px, 0, mf + 1), dr.clip(py, 0, mf + 1)
+        ix, iy = dr.minimum(uint(qx), m), dr.minimum(uint(qy), m)
+        fx, fy = qx - scalar(ix), qy - scalar(iy)
         width = m + 2
-        i = level_offset(self.n, k) + iy * width + ix
-        fetch = lambda j: dr.gather(vec4, self.texels, j)  # noqa: E731
-        return dr.lerp(
-            dr.lerp(fetch(i), fetch(i + 1), fx),
-            dr.lerp(fetch(i + width), fetch(i + width + 1), fx),
-            fy,
-        )
+        i = level_offset(self.n, k) + base + iy * width + ix
+        a, b, c, d = (dr.gather(vec4, self.texels, i + j) for j in (0, 1, width, width + 1))
+        upper, lower = dr.fma(b - a, fx, a), dr.fma(d - c, fx, c)
+        value = dr.fma(lower - upper, fy, upper)
+        if not slopes:
+            return [value]
+        in_x, in_y = dr.select(qx == px, mf, 0), dr.select(qy == py, mf, 0)
+        return [value, dr.lerp(b - a, d - c, fy) * in_x, (lower - upper) * in_y]
 
-    def __call__(self, x: Any, y: Any, level: Any) -> Any:
-        """RGBA at (x, y) in [0, 1]², row 0 at y = 0, trilinear in the level."""
+    def _trilinear(self, x: Any, y: Any, level: Any, slopes: bool, base: Any) -> list[Any]:
         scalar = type(x)
         uint = dr.uint32_array_t(scalar)
         top = self.n.bit_length() - 1
-        level = dr.clip(level, 0, top)
-        k = dr.minimum(uint(level), max(top - 1, 0))
-        return dr.lerp(self._level(k, x, y), self._level(k + min(top, 1), x, y), level - scalar(k))
+        clipped = dr.clip(level, 0, top)
+        k = dr.minimum(uint(clipped), max(top - 1, 0))
+        f = clipped - scalar(k)
+        fine = self._level(k, x, y, slopes, base)
+        coarse = self._level(k + min(top, 1), x, y, slopes, base)
+        out = [dr.fma(q - p, f, p) for p, q in zip(fine, coarse, strict=True)]
+        if slopes:
+            out.append(dr.select(clipped == level, coarse[0] - fine[0], 0))
+        return out
+
+    def __call__(self, x: Any, y: Any, level: Any, base: Any = 0) -> Any:
+        """RGBA at (x, y) in [0, 1]², row 0 at y = 0, trilinear in the level.
+
+        ``base``: where the texels of this pyramid begin, if others are stored before it.
+        """
+        return self._trilinear(x, y, level, False, base)[0]
+
+    def slopes(self, x: Any, y: Any, level: Any, base: Any = 0) -> list[Any]:
+        """[RGBA, ∂/∂x, ∂/∂y, ∂/∂level] at (x, y, level)."""
+        return self._trilinear(x, y, level, True, base)
 
 
 def level_offset(n: int, k: Any) -> Any:

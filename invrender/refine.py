@@ -1,21 +1,23 @@
 """Refinement: from initial maps and their uncertainty to the maps that explain the photo.
 
-The posterior of each pixel's nine parameters θ = (k_d, k_s, ρ, slopes p and q of n ∝ (p, q, 1)):
+First what all pixels of a material tell together (`invrender.lobes`), unless the initial maps know
+better; then each pixel's nine parameters θ = (k_d, k_s, ρ, slopes p and q of n ∝ (p, q, 1)) at the
+maximum of their posterior,
 
-    photo ~ N(I(θ), R),     θ = θ₀ + δ_material + δ_pixel,   δ ~ N(0, Σ),
+    photo ~ N(I(θ), R),     θ ~ N(θ₀, Σ),
 
-maximised by iterated Gauss–Newton steps in the three-dimensional space of the photo, with the exact
-Jacobian J of the forward model,
+by damped Gauss–Newton steps with the exact Jacobian J of the forward model. They are taken in the
+three-dimensional space of the photo, like a Kalman filter's,
 
-    θ ← θ₀ + ΣJᵀ(JΣJᵀ + R)⁻¹ (photo - I(θ) + J(θ - θ₀)).
+    θ ← θ₀ + ΣJᵀ(JΣJᵀ + R)⁻¹ (photo - I(θ) + J(θ - θ₀)),
 
-Where the photo says nothing about a parameter, J is small and the parameter keeps its initial value.
-The offset that pixels of one material share is found first, from all of them at once: each sees
-another part of the pattern, and together they pin down what a single pixel cannot.
+so where the photo says nothing about a parameter, J is small and the parameter keeps its prior
+value; and Σ - ΣJᵀ(JΣJᵀ + R)⁻¹JΣ is the uncertainty that remains.
 """
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -23,7 +25,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.cluster.vq import kmeans2
 
 from invrender.backend import Float, dr, vector
 from invrender.maps import Maps
@@ -36,23 +37,25 @@ D, S, R, N = slice(0, 3), slice(3, 6), 6, slice(7, 9)  # places of the parameter
 MIN_ROUGHNESS = 0.03
 MAX_SLOPE = 3.0  # 72 degrees
 PHOTO_NOISE = (0.02, 0.01)  # relative to the pixel, and to the photo's mean: sensor and model
+TRUST = (0.1, 0.2)  # how far one step may move roughness and slopes
+STOP = 0.005  # relative decrease of the mean cost below which steps end
 
 
 @dataclass
 class Prior:
-    """How far the truth may lie from the initial maps: standard deviations.
+    """What is known of θ before the photo is fitted: a Gaussian a pixel.
 
-    Arrays (H, W, 9) in the order of θ, or anything that broadcasts to it. ``shared``: the part of
-    it that pixels of one material have in common.
+    mean, sigma: (H, W, 9) in the order of θ; correlation: (9, 9), of the deviations.
     """
 
-    pixel: Array
-    shared: Array
+    mean: Array
+    sigma: Array
+    correlation: Array
 
 
 @dataclass
 class Refined:
-    """Maps, their posterior standard deviations (H, W, 9) and how the fit went."""
+    """Maps, their posterior standard deviations (H, W, 9) in the order of θ, how the fit went."""
 
     maps: Maps
     sigma: Array
@@ -60,39 +63,37 @@ class Refined:
     converged: bool = False
 
 
-def flat_prior(start: Maps) -> Prior:
-    """The uncertainty of `invrender.initial.flat_maps`: one lobe, no relief, light left in k_d."""
-    h, w = start.shape
-    pixel, shared = np.zeros((h, w, 9), np.float32), np.zeros((h, w, 9), np.float32)
-    metal = np.clip((start.specular - 0.06) / 0.3, 0, 1)
-    pixel[..., D], shared[..., D] = 0.02 + 0.3 * start.diffuse, 0.03 + 0.1 * start.diffuse
-    pixel[..., S], shared[..., S] = 0.002 + 0.1 * metal, 0.005 + 0.1 * metal
-    pixel[..., R], shared[..., R] = 0.06, 0.2
-    pixel[..., N], shared[..., N] = 0.15, 0.01
-    return Prior(pixel, shared)
+def lobe_prior(maps: Maps) -> Prior:
+    """The uncertainty within a material of maps from `invrender.lobes`: mostly shade and relief."""
+    mean = to_theta(maps)
+    sigma = np.zeros_like(mean)
+    metal = np.clip((maps.specular - 0.06) / 0.3, 0, 1)
+    sigma[..., D] = 0.01 + 0.05 * maps.diffuse
+    sigma[..., S] = 0.002 + 0.05 * metal
+    sigma[..., R], sigma[..., N] = 0.02, 0.05
+    correlation = np.eye(9)
+    for k, r in ((D, 0.98), (S, 0.95)):  # an albedo's channels vary together
+        correlation[k, k] = r + (1 - r) * np.eye(3)
+    return Prior(mean, sigma, correlation.astype(np.float32))
 
 
 def to_theta(maps: Maps) -> Array:
     """θ (H, W, 9) of maps."""
     slopes = maps.normal[..., :2] / np.maximum(maps.normal[..., 2:], 0.1)
-    return np.concatenate(
-        [maps.diffuse, maps.specular, maps.roughness[..., None], slopes], -1
-    ).astype(np.float32)
+    parts = [maps.diffuse, maps.specular, maps.roughness[..., None], slopes]
+    return project(np.concatenate(parts, -1).astype(np.float32))
 
 
 def to_maps(theta: Array) -> Maps:
-    """Maps of θ, within their physical ranges."""
+    """Maps of θ."""
     normal = np.concatenate([theta[..., N], np.ones_like(theta[..., :1])], -1)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    return Maps(
-        np.clip(theta[..., D], 0, 1),
-        np.clip(theta[..., S], 0, 1),
-        np.clip(theta[..., R], MIN_ROUGHNESS, 1),
-        normal.astype(np.float32),
-    )
+    parts = (theta[..., D], theta[..., S], theta[..., R], normal)
+    return Maps(*(np.ascontiguousarray(p, dtype=np.float32) for p in parts))
 
 
-def _project(theta: Array) -> Array:
+def project(theta: Array) -> Array:
+    """θ within its physical range, in place."""
     theta[..., :6] = np.clip(theta[..., :6], 0, 1)
     theta[..., R] = np.clip(theta[..., R], MIN_ROUGHNESS, 1)
     slope = np.linalg.norm(theta[..., N], axis=-1, keepdims=True)
@@ -103,7 +104,7 @@ def _project(theta: Array) -> Array:
 def linearise(
     prepared: Tables | Unbiased, theta: Array, samples: int, seed: int = 0
 ) -> tuple[Array, Array]:
-    """Radiance (H, W, 3) at θ and its Jacobian (H, W, 3, 9)."""
+    """Radiance (H, W, 3) at θ (H, W, 9) and its Jacobian (H, W, 3, 9)."""
     h, w = theta.shape[:2]
     flat = np.ascontiguousarray(theta.reshape(-1, 9).T)
     vec3 = vector(Float, 3)
@@ -112,113 +113,91 @@ def linearise(
     j = pixel_jacobian(prepared, make_view(prepared.scene, h, w, seed), material, samples)
     slope_p = j.tangent_s * j.s.x + j.tangent_t * j.t.x
     slope_q = j.tangent_s * j.s.y + j.tangent_t * j.t.y
-    dr.schedule(j.radiance, j.diffuse, j.specular, j.roughness, slope_p, slope_q)
-    rows = lambda x: np.asarray(x).T.reshape(h, w, 3)  # noqa: E731
+    dr.eval(j.radiance, j.diffuse, j.specular, j.roughness, slope_p, slope_q)
+
+    def rows(x: Any) -> Array:
+        return np.asarray(x).T.reshape(h, w, 3)
+
     jacobian = np.zeros((h, w, 3, 9), np.float32)
     for c in range(3):
         jacobian[..., c, c] = rows(j.diffuse)[..., c]
         jacobian[..., c, 3 + c] = rows(j.specular)[..., c]
-    jacobian[..., R], jacobian[..., 7], jacobian[..., 8] = map(
-        rows, (j.roughness, slope_p, slope_q)
-    )
-    return rows(j.radiance).copy(), jacobian
-
-
-def materials(start: Maps, photo: Array, count: int) -> NDArray[np.intp]:
-    """Labels (H, W) of pixels that look alike in their initial maps."""
-    theta = to_theta(start)[..., :7].reshape(-1, 7).astype(np.float64)
-    theta[:, D] = np.sqrt(theta[:, D])
-    theta /= np.maximum(theta.std(0), 0.05)
-    if count < 2 or len(theta) < 50 * count:
-        return np.zeros(start.shape, np.intp)
-    rng = np.random.default_rng(0)
-    some = theta[rng.choice(len(theta), min(len(theta), 4096), replace=False)]
-    centres, _ = kmeans2(some, count, minit="++", rng=rng)
-    distance = ((theta[:, None] - centres[None]) ** 2).sum(-1)
-    return distance.argmin(1).reshape(start.shape)
+    for k, derivative in ((R, j.roughness), (7, slope_p), (8, slope_q)):
+        jacobian[..., k] = rows(derivative)
+    return rows(j.radiance).copy(), np.nan_to_num(jacobian, posinf=0, neginf=0)
 
 
 def refine(
     photo: Array,
     prepared: Tables | Unbiased,
-    start: Maps,
     prior: Prior,
     *,
     samples: int = 64,
-    iterations: int = 12,
+    iterations: int = 10,
     clipped: NDArray[np.bool_] | None = None,
     progress: Callable[[int, float], None] = lambda i, error: None,
 ) -> Refined:
-    """Refine maps for a photo (H, W, 3) of the sample, linear radiance.
+    """The pixels' maximum a posteriori for a photo (H, W, 3) of the sample, linear radiance.
 
-    clipped (H, W): pixels that the photo does not measure. Stops when a step changes the photo
-    error by less than 1%.
+    clipped (H, W): pixels that the photo does not measure; they keep their prior. Starts at the
+    prior's mean, stops when a step lowers the mean cost by less than `STOP`. A pixel whose step
+    would raise its cost stays, and tries a shorter one next.
     """
     began = time.perf_counter()
-    h, w = start.shape
-    theta0 = to_theta(start)
-    theta, offset = theta0.copy(), np.zeros_like(theta0)
-    label = materials(start, photo, 6)
     mean = max(float(photo.mean()), 1e-12)
     noise = (PHOTO_NOISE[0] * photo) ** 2 + (PHOTO_NOISE[1] * mean) ** 2
     if clipped is not None:
-        noise = np.where(clipped[..., None], 1e6 * mean**2, noise)
-    result = Refined(start, prior.pixel)
-    last = np.inf
-    for i in range(iterations + 1):
+        noise = np.where(clipped[..., None], np.float32(1e12) * mean**2, noise)
+    sigma, correlation = prior.sigma, prior.correlation
+    precision = np.linalg.inv(correlation)
+
+    def evaluate(theta: Array) -> tuple[Array, Array, Array]:
         image, jacobian = linearise(prepared, theta, samples)
+        z = (theta - prior.mean) / sigma
         residual = photo - image
+        misfit = (residual**2 / noise).sum(-1)
+        return residual, jacobian, misfit + np.einsum("hwp,pq,hwq->hw", z, precision, z)
+
+    theta = project(prior.mean.copy())
+    residual, jacobian, cost = evaluate(theta)
+    length = np.ones(cost.shape, np.float32)
+    result = Refined(to_maps(theta), sigma)
+    for i in range(iterations + 1):
         seen = residual if clipped is None else residual[~clipped]
-        error = float(np.sqrt(np.mean(seen**2))) / mean
-        result.history.append({"seconds": time.perf_counter() - began, "photo_error": error})
-        progress(i, error)
-        if i == iterations or abs(last - error) < 0.01 * error:
-            result.converged = i < iterations
-            break
-        last = error
-        # Huber: a residual that noise and prior cannot explain counts less.
-        pixel = prior.pixel**2
-        spread = np.einsum("hwcp,hwp,hwdp->hwcd", jacobian, pixel, jacobian)
-        spread[..., range(3), range(3)] += noise
-        linear = residual + np.einsum("hwcp,hwp->hwc", jacobian, theta - theta0)
-        weight = np.linalg.inv(spread)
-        offset = _shared_offset(label, jacobian, weight, linear, prior.shared)
-        rest = linear - np.einsum("hwcp,hwp->hwc", jacobian, offset)
-        step = np.einsum("hwp,hwcp,hwcd,hwd->hwp", pixel, jacobian, weight, rest)
-        new = theta0 + offset + step
-        theta = _project(theta + _limit(new - theta))
-        result.sigma = np.sqrt(
-            np.maximum(
-                pixel
-                - np.einsum("hwp,hwcp,hwcd,hwdp,hwp->hwp", pixel, jacobian, weight, jacobian, pixel),
-                0,
-            )
+        error = float(np.sqrt(np.mean(seen**2))) / mean if seen.size else 0.0
+        seconds = time.perf_counter() - began
+        result.history.append(
+            {"seconds": seconds, "photo_error": error, "cost": float(cost.mean())}
         )
+        progress(i, error)
+        if i and result.history[-2]["cost"] - cost.mean() <= STOP * cost.mean():
+            result.converged = True
+            break
+        if i == iterations:
+            break
+        a = jacobian * sigma[..., None, :]
+        ac = a @ correlation
+        spread = ac @ np.swapaxes(a, -1, -2)
+        spread[..., range(3), range(3)] += noise
+        gain = np.swapaxes(ac, -1, -2) @ np.linalg.inv(spread)
+        z = (theta - prior.mean) / sigma
+        target = residual + np.einsum("hwcp,hwp->hwc", a, z)
+        step = sigma * (np.einsum("hwpc,hwc->hwp", gain, target) - z)
+        step[..., R] = np.clip(step[..., R], -TRUST[0], TRUST[0])
+        step[..., N] = np.clip(step[..., N], -TRUST[1], TRUST[1])
+        trial = project(theta + length[..., None] * step)
+        new = evaluate(trial)
+        better = new[2] < cost
+        for old, fresh in zip((theta, residual, jacobian, cost), (trial, *new), strict=True):
+            old[better] = fresh[better]
+        length = np.where(better, np.minimum(2 * length, 1), length / 4)
+        left = 1 - np.einsum("hwpc,hwcp->hwp", gain, ac)
+        result.sigma = sigma * np.sqrt(np.clip(left, 0, 1))
     result.maps = to_maps(theta)
     return result
 
 
-def _limit(step: Array) -> Array:
-    """Trust region: how far one linearisation may move roughness and slopes."""
-    step[..., R] = np.clip(step[..., R], -0.1, 0.1)
-    step[..., N] = np.clip(step[..., N], -0.2, 0.2)
-    return step
+if __name__ == "__main__":
+    from invrender.cli import main
 
-
-def _shared_offset(
-    label: NDArray[np.intp], jacobian: Array, weight: Array, linear: Array, shared: Array
-) -> Array:
-    """The offset that the pixels of each material share, (H, W, 9), by generalised least squares."""
-    offset = np.zeros_like(shared)
-    for k in range(int(label.max()) + 1):
-        of = label == k
-        if not of.any():
-            continue
-        jw = np.einsum("ncp,ncd->ndp", jacobian[of], weight[of])
-        information = np.einsum("ndp,ndq->pq", jw, jacobian[of]).astype(np.float64)
-        force = np.einsum("ndp,nd->p", jw, linear[of]).astype(np.float64)
-        scale = shared[of].mean(0).astype(np.float64)
-        # Pixels side by side share texture and relief: count every one in eight as independent.
-        a = information / 8 * scale[:, None] * scale[None] + np.eye(9)
-        offset[of] = (scale * np.linalg.solve(a, force / 8 * scale)).astype(np.float32)
-    return offset
+    sys.exit(main(["refine", *sys.argv[1:]]))

@@ -132,20 +132,55 @@ def environment_at(scene: Scene, d: Any) -> Any:
     return scene.scale * _bilinear(scene.environment, h, 2 * h, u * (2 * h), v * h, wrap=True)
 
 
+@dataclass
+class ScreenFrame:
+    """The screen's plane as points see it: what `hit` needs of them, computed once.
+
+    normal: unit, upwards. along_s, along_t: edges over their squared lengths. distance: height of
+    the plane above a point. s, t: the point's foot. area: of the screen.
+    """
+
+    normal: Any
+    along_s: Any
+    along_t: Any
+    distance: Any
+    s: Any
+    t: Any
+    area: Any
+
+    def hit(self, d: Any) -> tuple[Any, Any, Any, Any, Any]:
+        """Where rays x + r·d meet the plane: (s, t, r, cos, ahead), cos positive from below.
+
+        Rays that are not ahead have (s, t) of no meaning and r = distance.
+        """
+        cos = dr.dot(d, self.normal)
+        ahead = (cos > 1e-6) & (self.distance > 0)
+        r = self.distance / dr.select(ahead, cos, 1)
+        s = dr.fma(r, dr.dot(d, self.along_s), self.s)
+        t = dr.fma(r, dr.dot(d, self.along_t), self.t)
+        return s, t, r, cos, ahead
+
+
+def screen_frame(scene: Scene, x: Any) -> ScreenFrame:
+    """The `ScreenFrame` of points x."""
+    cross = dr.cross(scene.edge_x, scene.edge_y)
+    area = dr.norm(cross)
+    normal = cross / area
+    along_s = scene.edge_x / dr.squared_norm(scene.edge_x)
+    along_t = scene.edge_y / dr.squared_norm(scene.edge_y)
+    offset = x - scene.corner
+    return ScreenFrame(
+        normal, along_s, along_t, -dr.dot(offset, normal),
+        dr.dot(offset, along_s), dr.dot(offset, along_t), area,
+    )  # fmt: skip
+
+
 def hit_screen(scene: Scene, x: Any, d: Any) -> tuple[Any, Any, Any, Any, Any]:
     """Where rays x + r·d meet the screen's plane: (s, t, r, cos, hit).
 
     cos is the angle at the screen (positive from below); hit tells whether (s, t) is inside.
     """
-    m = dr.normalize(dr.cross(scene.edge_x, scene.edge_y))
-    cos = dr.dot(d, m)
-    ahead = cos > 1e-6
-    offset = x - scene.corner
-    r = -dr.dot(offset, m) / dr.select(ahead, cos, 1)
-    p = dr.fma(d, r, offset)
-    s = dr.dot(p, scene.edge_x) / dr.squared_norm(scene.edge_x)
-    t = dr.dot(p, scene.edge_y) / dr.squared_norm(scene.edge_y)
-    ahead &= r > 0
+    s, t, r, cos, ahead = screen_frame(scene, x).hit(d)
     return s, t, r, cos, ahead & (s >= 0) & (s < 1) & (t >= 0) & (t < 1)
 
 

@@ -24,9 +24,10 @@ class Shading:
     tangents: list[tuple[Any, Any, Any]]
 
 
-def _with_tangents(
+def with_tangents(
     f: Callable[[Any, Any], tuple[Any, ...]], rho: Any, n: Any
 ) -> tuple[list[Any], list[list[Any]]]:
+    """Values of f(ρ, n) and their derivatives along ρ and the normal's tangents s and t."""
     scalar = type(rho)
     s, t = brdf.frame(n)
     with dr.resume_grad():
@@ -50,44 +51,41 @@ def _with_tangents(
     return values, tangents
 
 
-def _without_tangents(
-    f: Callable[[Any, Any], tuple[Any, ...]], rho: Any, n: Any
-) -> tuple[list[Any], list[list[Any]]]:
-    return list(f(rho, n)), []
-
-
 class Sums:
-    """Running sums of E, B and A and of their tangents."""
+    """Running sums of E, B and A and, where ``jacobian``, of their tangents: rows of three."""
 
     def __init__(self, vec3: type, width: int, jacobian: bool) -> None:
         self.rows = [[dr.zeros(vec3, width) for _ in range(3)] for _ in range(4 if jacobian else 1)]
-        self.derive = _with_tangents if jacobian else _without_tangents
+        self.jacobian = jacobian
         self.width = width
 
-    def add(self, f: Any, targets: tuple[int, ...], rho: Any, n: Any) -> None:
-        """Add f(rho, n) to the targets: 0, 1, 2 are E, B, A."""
-        values, tangents = self.derive(f, rho, n)
-        for row, terms in zip(self.rows, [values, *tangents], strict=True):
+    def derive(self, f: Any, rho: Any, n: Any) -> list[list[Any]]:
+        """Rows of f(ρ, n): its values and, if this holds any, their tangents."""
+        if not self.jacobian:
+            return [list(f(rho, n))]
+        values, tangents = with_tangents(f, rho, n)
+        return [values, *tangents]
+
+    def add(self, rows: list[list[Any]], targets: tuple[int, ...]) -> None:
+        """Add rows to the targets: 0, 1, 2 are E, B, A."""
+        for row, terms in zip(self.rows, rows, strict=True):
             for k, term in zip(targets, terms, strict=True):
                 row[k] = row[k] + term
 
     def run(
         self,
         count: Any,
-        sample: Callable[[Any, Any, Any], tuple[Any, ...]],
+        rows: Callable[[Any], list[list[Any]]],
         targets: tuple[int, ...],
         label: str,
-        rho: Any,
-        n: Any,
         factor: Any = 1,
         start: Any = 0,
     ) -> None:
-        """Add factor · sample(i, rho, n) for i from start below count."""
+        """Add factor · rows(i) for i from start below count, which may differ between pixels."""
         uint = type(count)
 
         def body(i: Any, *sums: Any) -> tuple[Any, ...]:
-            values, tangents = self.derive(lambda r, m: sample(i, r, m), rho, n)
-            terms = [x for row in (values, *tangents) for x in row]
+            terms = [x for row in rows(i) for x in row]
             return (i + 1, *(x + y for x, y in zip(sums, terms, strict=True)))
 
         step = len(targets)

@@ -44,7 +44,15 @@ def simulate(
     if folder.exists() and any(folder.iterdir()):
         raise InputError(f"{folder} exists and is not empty; choose another folder")
     photo = photograph(
-        rig, maps, pattern, environment, gain, height=width * 3 // 4, width=width, spp=spp, seed=seed
+        rig,
+        maps,
+        pattern,
+        environment,
+        gain,
+        height=width * 3 // 4,
+        width=width,
+        spp=spp,
+        seed=seed,
     )
     if noise > 0:
         rng = np.random.default_rng(seed)

@@ -12,14 +12,16 @@ import numpy as np
 
 from invrender.backend import dr, vector
 from invrender.pyramid import Pyramid, disc, disc_direction, level_offset
-from invrender.scene import Scene, environment_at, hit_screen, pattern_at
+from invrender.scene import Scene, ScreenFrame, environment_at, hit_screen, pattern_at
 
 HOT_SHARE = 0.004  # a texel whose flux exceeds this share of the environment's is a lamp of its own
 MAX_HOT = 64
-LAMP_SIDES = (1, 2, 3, 4)  # points a side in a lamp, for lobes of falling width
+LAMP_SIDES = 4  # at most so many points a side in a lamp, more of them as samples grow
+SCREEN_TEXELS = 256  # at least so many a side on the screen, so that its edge is sharp
 T_SIZE = 32  # normals a side in the table of T
 T_EXTENT = 1.1  # of its square beyond the unit disc, so that the rim is interpolated too
 V_SIZE = 16  # sample points a side in the table of V
+SKY_TEXELS = 2  # of the disc a side for each row of the environment
 QUAD = 32  # screen cells a side in V's quadrature
 
 
@@ -28,7 +30,8 @@ class Tables:
     """What the fast estimator reads; rebuilt when the lights or the screen's pose change.
 
     screen: RGBA pyramid of gain × pattern. sky: RGBA pyramid of the environment above the table on
-    Lambert's disc, without its lamps and what the screen hides from the whole sample (A = 0 there).
+    Lambert's disc, without its lamps and what the screen hides from the whole sample (A = 0 there);
+    where there are lamps, a second one that holds them follows it.
     sky_irradiance: T(n), its irradiance on a disc of normals.
     vector_irradiance: V(x) of the screen minus that of the sky behind it, 9 values on a grid over
     the sample. Lamps: directions, polar extents and flux of the brightest texels.
@@ -71,7 +74,7 @@ def _grid(uint: type, scalar: type, n: int) -> tuple[Any, Any]:
 
 def _screen_pyramid(scene: Scene) -> Pyramid:
     scalar = scene.scalar
-    n = _power_of_two(scene.pattern_size)
+    n = max(_power_of_two(scene.pattern_size), SCREEN_TEXELS)
     x, y = _grid(dr.uint32_array_t(scalar), scalar, n)
     rgb = pattern_at(scene, x, 1 - y)
     return Pyramid.build(vector(scalar, 4)(rgb.x, rgb.y, rgb.z, 1), n)
@@ -116,19 +119,28 @@ def _split_lamps(tables: Tables) -> None:
         _lamp_points(tables, hot)
     without = replace(scene, environment=rest)
 
-    n = min(_power_of_two(h), 512)
+    n = min(SKY_TEXELS * _power_of_two(h), 1024)
     sub = 2  # 2 × 2 sub-texels, each a bilinear look-up
     x, y = _grid(uint, scalar, n)
     total = vec4(0)
+    total_lit = vec4(0)
     for i in range(sub * sub):
         px = x * 2 - 1 + ((i % sub + 0.5) / sub - 0.5) * (2 / n)
         py = 1 - y * 2 + ((i // sub + 0.5) / sub - 0.5) * (2 / n)
         inside = px * px + py * py < 1
         d = disc_direction(dr.select(inside, px, 0), dr.select(inside, py, 0), vec3)
         hidden, _ = _corner_hits(dr.detach(scene), d, 0)
-        seen = dr.select(inside & ~hidden, environment_at(without, d), 0)
-        total += vec4(seen.x, seen.y, seen.z, dr.select(inside & hidden, scalar(0), 1))
+        shown = inside & ~hidden
+        cover = dr.select(inside & hidden, scalar(0), 1)
+        seen = dr.select(shown, environment_at(without, d), 0)
+        total += vec4(seen.x, seen.y, seen.z, cover)
+        if len(hot):
+            seen = dr.select(shown, environment_at(scene, d), 0)
+            total_lit += vec4(seen.x, seen.y, seen.z, cover)
     tables.sky = Pyramid.build(total / (sub * sub), n)
+    if len(hot):
+        lit = Pyramid.build(total_lit / (sub * sub), n)
+        tables.sky = Pyramid(dr.concat((tables.sky.texels, lit.texels)), n)
 
 
 def _corner_hits(scene: Scene, d: Any, margin: float) -> tuple[Any, Any]:
@@ -159,55 +171,86 @@ def _corner_hits(scene: Scene, d: Any, margin: float) -> tuple[Any, Any]:
 def _lamp_points(tables: Tables, hot: np.ndarray) -> None:
     """Precompute each lamp's points: 1, 4, 9 and 16 strata of its bilinear tent.
 
-    Lamps that the whole screen hides from the whole sample are dropped; those that it hides from
-    nobody come first, so that only the rest are tested for occlusion.
+    A point: direction and solid angle, then the half-widths of a tent, in radians along θ and φ,
+    that has the stratum's variance.
     """
     scene = tables.scene
     scalar = scene.scalar
     h = scene.env_height
     blocks = []
-    for side in LAMP_SIDES:
+    for side in range(1, LAMP_SIDES + 1):
         strata = (np.arange(side) + 0.5) / side
         tent = np.where(strata < 0.5, np.sqrt(2 * strata) - 1, 1 - np.sqrt(2 - 2 * strata))
+        width = np.sqrt(1 - 6 * np.mean(tent**2)) * np.pi / h
         theta = (hot[:, None, None] // (2 * h) + 0.5 + tent[None, :, None]) * (np.pi / h)
         phi = (hot[:, None, None] % (2 * h) + 0.5 + tent[None, None, :]) * (np.pi / h)
         theta, phi = np.broadcast_arrays(theta, phi)
-        weight = np.abs(np.sin(theta)) * (np.pi / h) ** 2 / side**2
-        points = [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta), weight]
-        blocks.append(np.stack(points, -1).reshape(-1))
+        sin = np.abs(np.sin(theta))
+        weight = sin * (np.pi / h) ** 2 / side**2
+        direction = [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)]
+        zero = np.zeros_like(theta)
+        point = [*direction, weight, zero + width, width * np.maximum(sin, 1e-3), zero, zero]
+        blocks.append(np.stack(point, -1).reshape(-1))
     tables.lamp_points = scalar(np.concatenate(blocks))
 
 
-def lamp_point(tables: Tables, i: Any, side: Any) -> tuple[Any, Any, Any]:
-    """Point i of the lamps at side² points a lamp: (direction, its solid angle, radiance)."""
+def lamp_side(samples: Any) -> Any:
+    """Points a side that each lamp is split into, for a number of specular samples."""
+    scalar = dr.float32_array_t(type(samples))
+    return dr.clip(type(samples)(dr.sqrt(scalar(samples)) * (1 / 16)), 1, LAMP_SIDES)
+
+
+def lamp_at(tables: Tables, screen: ScreenFrame | None, i: Any, side: Any) -> tuple[Any, Any]:
+    """Point i of the lamps' side² each: (direction, radiance × solid angle that reaches x)."""
     scalar = tables.scene.scalar
     vec3, vec4 = vector(scalar, 3), vector(scalar, 4)
     # Points of the coarser subdivisions come before: 0, 1, 1 + 4, 1 + 4 + 9 a lamp.
     before = (side - 1) * side * (2 * side - 1) // 6 * tables.lamp_count
-    point = dr.gather(vec4, tables.lamp_points, before + i)
-    radiance = dr.gather(vec3, tables.lamp_radiance, i // (side * side))
-    return vec3(point.x, point.y, point.z), point.w, radiance
+    point = dr.gather(vec4, tables.lamp_points, 2 * (before + i))
+    d = vec3(point.x, point.y, point.z)
+    light = dr.gather(vec3, tables.lamp_radiance, i // (side * side))
+    light = light * dr.select(d.z > 0, point.w, 0)
+    if screen is None or tables.lamp_open == tables.lamp_count:
+        return d, light
+    # The screen's edge covers the point's tent bit by bit: project its widths to (s, t).
+    extent = dr.gather(vec4, tables.lamp_points, 2 * (before + i) + 1)
+    ps, pt, r, cos, ahead = screen.hit(d)
+    cos = dr.select(ahead, cos, 1)
+    inverse_sin2 = dr.rcp(dr.maximum(1 - d.z * d.z, 1e-6))
+
+    def inside(p: Any, along: Any) -> Any:
+        slope = dr.fma(screen.normal, -dr.dot(d, along) / cos, along)  # ⟂ d, times r
+        across = dr.square(slope.y * d.x - slope.x * d.y) * inverse_sin2
+        down = dr.maximum(dr.squared_norm(slope) - across, 0)
+        width = r * dr.sqrt(dr.fma(dr.square(extent.x), down, dr.square(extent.y) * across) + _TINY)
+        return _tent_below(p / width) - _tent_below((p - 1) / width)
+
+    covered = inside(ps, screen.along_s) * inside(pt, screen.along_t)
+    return d, light * (1 - dr.select(ahead, covered, 0))
 
 
-def sky_at(tables: Tables, d: Any, solid_angle: Any, bias: float = 0.0) -> Any:
-    """RGBA of the sky pyramid along d, averaged over about ``solid_angle``.
+_TINY = 1e-30  # keeps the square root's slope finite
 
-    RGB is the average of what any point of the sample can see, A the share of the footprint that
-    it covers: RGB/A is the mean radiance of the part that the screen does not always hide.
-    """
+
+def _tent_below(x: Any) -> Any:
+    """Integral of the tent 1 - |x| from -1 to x."""
+    x = dr.clip(x, -1, 1)
+    return 0.5 + x - 0.5 * x * dr.abs(x)
+
+
+def sky_level(tables: Tables, solid_angle: Any) -> Any:
+    """Level of the sky pyramid whose texels are about as large as ``solid_angle``."""
     assert tables.sky is not None
     n = tables.sky.n
-    x, y = disc(d)
     # A texel of the disc has area (2/n)² and twice that in solid angle.
-    level = 0.5 * dr.log2(solid_angle * (n * n / 8)) + bias
-    return tables.sky(dr.fma(x, 0.5, 0.5), dr.fma(y, -0.5, 0.5), level)
+    return 0.5 * dr.log2(solid_angle * (n * n / 8))
 
 
-def screen_at(tables: Tables, s: Any, t: Any, area: Any, bias: float = 0.0) -> Any:
-    """RGBA of the screen averaged over about ``area`` (of the unit square) around (s, t)."""
+def screen_level(tables: Tables, area: Any) -> Any:
+    """Level of the screen's pyramid whose texels are about ``area``, of the unit square."""
     assert tables.screen is not None
     n = tables.screen.n
-    return tables.screen(s, 1 - t, 0.5 * dr.log2(area * (n * n)) + bias)
+    return 0.5 * dr.log2(area * (n * n))
 
 
 def _sky_irradiance(tables: Tables) -> Any:
@@ -305,7 +348,9 @@ def screen_cell(tables: Tables, x: Any, i: Any, side: int) -> tuple[Any, Any, An
             texel = pyramid(s, 1 - t, scalar(0))
         radiance = vec3(texel.x, texel.y, texel.z)
     if tables.sky is not None:
-        sky = sky_at(tables, d, omega, -0.5)
+        x, y = disc(d)
+        level = sky_level(tables, omega) - 0.5
+        sky = tables.sky(dr.fma(x, 0.5, 0.5), dr.fma(y, -0.5, 0.5), level)
         radiance = radiance - vec3(sky.x, sky.y, sky.z)
     return d, omega, radiance
 

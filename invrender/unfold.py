@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy import ndimage, sparse
 from scipy.sparse.linalg import spsolve
 
+from invrender.environments import directions
 from invrender.errors import InputError
 from invrender.images import Photo
 from invrender.mirror import Ball, mirror_normals
@@ -22,23 +23,6 @@ from invrender.rig import Rig
 Array = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]
 SCREEN_MARGIN = 1.5  # pixels around the screen's image that may hold some of its light
-
-
-def directions(height: int, rows: Array | None = None, columns: Array | None = None) -> Array:
-    """Unit directions of an equirectangular map's texels, (H, 2H, 3) without ``rows``/``columns``.
-
-    Rows and columns may be given as fractions of the map's height and width.
-    """
-    v = (np.arange(height) + 0.5) / height if rows is None else rows
-    u = (np.arange(2 * height) + 0.5) / (2 * height) if columns is None else columns
-    theta, phi = np.meshgrid(np.pi * v, 2 * np.pi * u, indexing="ij")
-    return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
-
-
-def solid_angles(height: int) -> Array:
-    """Solid angle of each texel by row, (H,), in steradians."""
-    edge = np.cos(np.pi * np.arange(height + 1) / height)
-    return (edge[:-1] - edge[1:]) * (2 * np.pi / (2 * height))
 
 
 def screen_coordinates(rig: Rig, origin: Array, direction: Array) -> tuple[Array, Array, Mask]:
@@ -122,9 +106,7 @@ def unfold_environment(
     mask, (rows, columns) = screen_mask(rig, ball, SCREEN_MARGIN)
     origin = (rows.start, columns.start)
     half = height // 2
-    v = (np.arange(half * samples) + 0.5) / (samples * height)
-    u = (np.arange(2 * height * samples) + 0.5) / (2 * samples * height)
-    wanted = directions(height, v, u)
+    wanted = directions(samples * height, 2 * samples * height)[: half * samples].astype(float)
     centre = np.asarray(ball.position)
     normal = mirror_normals(rig, centre, ball.radius_m, wanted, False)
     pixels = rig.project(centre + ball.radius_m * normal, *ball.size)

@@ -26,9 +26,9 @@ from invrender.materials import (
     rotate_maps,
     turn_maps,
 )
-from invrender.materials_files import material_files
-from invrender.materials_noise import Canvas, noise
-from invrender.materials_patterns import WEAVES, bricks, voronoi, weave
+from invrender.materials.files import material_files
+from invrender.materials.noise import Canvas, noise
+from invrender.materials.patterns import WEAVES, bricks, voronoi, weave
 
 FIELDS = ("diffuse", "specular", "roughness", "normal")
 

@@ -11,7 +11,7 @@ from scipy.sparse import csr_array
 
 from invrender.errors import InputError
 from invrender.maps import NAMES, Maps
-from invrender.materials_patterns import slopes, smoothstep
+from invrender.materials.patterns import slopes, smoothstep
 
 Array = NDArray[np.floating[Any]]
 

@@ -1,9 +1,6 @@
-"""Materials to train and test on: made up, read from files, and varied.
+"""Materials to train and test on: made up, read from files, and varied."""
 
-The work is done in the modules beside this one; this is what others import.
-"""
-
-from invrender.materials_augment import (
+from invrender.materials.augment import (
     augment,
     check_maps,
     crop_maps,
@@ -13,15 +10,15 @@ from invrender.materials_augment import (
     rotate_maps,
     turn_maps,
 )
-from invrender.materials_files import (
+from invrender.materials.files import (
     find_materials,
     handedness,
     is_directx,
     load_materials,
     read_material,
 )
-from invrender.materials_patterns import normals_from_height
-from invrender.materials_procedural import PRESETS, procedural_material
+from invrender.materials.patterns import normals_from_height
+from invrender.materials.procedural import PRESETS, procedural_material
 
 __all__ = [
     "PRESETS",

@@ -1,9 +1,4 @@
-"""Environment light: files and, from the modules beside this one, integrals and made-up rooms.
-
-An environment is an equirectangular image (H, W, 3) of linear radiance, usually W = 2H: row 0 at
-the zenith (+z), column u at φ = 2π·u/W, φ = atan2(y, x). Its unit is arbitrary until
-`scale_environment` says what it gives on the table.
-"""
+"""Environment light from files, equirectangular EXR and Radiance HDR."""
 
 from __future__ import annotations
 
@@ -14,32 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from invrender.environments_lamps import add_light
-from invrender.environments_procedural import KINDS, procedural_environment
-from invrender.environments_sphere import (
-    directions,
-    irradiance,
-    resample_environment,
-    rotate_environment,
-    scale_environment,
-    solid_angles,
-)
+from invrender.environments.sphere import resample_environment
 from invrender.errors import InputError
 from invrender.images import MAX_PIXELS, read_image
-
-__all__ = [
-    "KINDS",
-    "add_light",
-    "directions",
-    "find_environments",
-    "irradiance",
-    "procedural_environment",
-    "read_environment",
-    "resample_environment",
-    "rotate_environment",
-    "scale_environment",
-    "solid_angles",
-]
 
 Array = NDArray[np.floating[Any]]
 log = logging.getLogger("invrender")

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from invrender.environments_lamps import add_light, white_balance
-from invrender.environments_sphere import directions
-from invrender.materials_layers import chance, colour, dye, earth, grey, log_uniform, uniform
-from invrender.materials_patterns import Canvas, noise
+from invrender.environments.lamps import add_light, white_balance
+from invrender.environments.sphere import directions
+from invrender.materials.layers import chance, colour, dye, earth, grey, log_uniform, uniform
+from invrender.materials.patterns import Canvas, noise
 
 Array = NDArray[np.floating[Any]]
 Rng = np.random.Generator

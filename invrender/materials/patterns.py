@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from invrender.materials_noise import (
+from invrender.materials.noise import (
     Array,
     Canvas,
     Ints,

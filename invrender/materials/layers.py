@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from invrender.materials_patterns import Canvas, Points, noise
+from invrender.materials.patterns import Canvas, Points, noise
 
 Array = NDArray[np.floating[Any]]
 Range = tuple[float, float]

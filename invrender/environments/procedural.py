@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from invrender.environments_lamps import add_light, white_balance
-from invrender.environments_rooms import room
-from invrender.environments_sphere import directions, solid_angles
+from invrender.environments.lamps import add_light, white_balance
+from invrender.environments.rooms import room
+from invrender.environments.sphere import directions, solid_angles
 from invrender.errors import InputError
-from invrender.materials_layers import chance, colour, dye, earth, grey, log_uniform, uniform
-from invrender.materials_patterns import Canvas, noise, smoothstep
+from invrender.materials.layers import chance, colour, dye, earth, grey, log_uniform, uniform
+from invrender.materials.patterns import Canvas, noise, smoothstep
 
 Array = NDArray[np.floating[Any]]
 Rng = np.random.Generator

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from invrender.errors import InputError
 from invrender.images import read_image
 from invrender.maps import NAMES, Maps, read_maps
-from invrender.materials_augment import check_maps, resize, resize_maps
+from invrender.materials.augment import check_maps, resize, resize_maps
 
 Array = NDArray[np.floating[Any]]
 log = logging.getLogger("invrender")

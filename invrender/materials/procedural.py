@@ -7,12 +7,11 @@ from collections.abc import Callable
 import numpy as np
 from scipy.ndimage import uniform_filter
 
-from invrender import materials_hard as hard
-from invrender import materials_metal as metals
-from invrender import materials_soft as soft
 from invrender.errors import InputError
 from invrender.maps import Maps
-from invrender.materials_layers import (
+from invrender.materials import hard, soft
+from invrender.materials import metal as metals
+from invrender.materials.layers import (
     Layers,
     chance,
     dye,
@@ -21,7 +20,7 @@ from invrender.materials_layers import (
     metal,
     uniform,
 )
-from invrender.materials_patterns import (
+from invrender.materials.patterns import (
     Array,
     Canvas,
     mixed,

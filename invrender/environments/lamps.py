@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from invrender.environments_sphere import solid_angles
+from invrender.environments.sphere import solid_angles
 
 Array = NDArray[np.floating[Any]]
 

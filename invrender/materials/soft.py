@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from invrender.materials_layers import (
+from invrender.materials.layers import (
     Layers,
     bumps,
     chance,
@@ -17,7 +17,7 @@ from invrender.materials_layers import (
     uniform,
     varied,
 )
-from invrender.materials_patterns import (
+from invrender.materials.patterns import (
     WEAVES,
     Array,
     Canvas,
@@ -29,7 +29,7 @@ from invrender.materials_patterns import (
     warped,
     weave,
 )
-from invrender.materials_patterns import bricks as brick_cells
+from invrender.materials.patterns import bricks as brick_cells
 
 Rng = np.random.Generator
 

@@ -1,0 +1,5 @@
+import sys
+
+from invrender.cli import main
+
+sys.exit(main())

@@ -1,0 +1,173 @@
+"""The command line: ``invrender refine`` and ``invrender simulate``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from invrender.errors import InputError
+
+EXAMPLE = Path(__file__).parent / "data" / "example"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command; returns the exit code: 0 done, 2 bad input, 130 interrupted."""
+    parser = _parser()
+    args = parser.parse_args(argv)
+    console = Console(stderr=True, quiet=getattr(args, "quiet", False))
+    try:
+        return int(args.run(args, console))
+    except InputError as error:
+        Console(stderr=True).print(f"invrender: {error}", markup=False, highlight=False)
+        return 2
+    except KeyboardInterrupt:
+        Console(stderr=True).print("invrender: interrupted, nothing was written")
+        return 130
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="invrender",
+        description="One photo under a tablet's light pattern in, relightable material maps out.",
+    )
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    refine = commands.add_parser(
+        "refine",
+        help="recover the material maps of a capture",
+        description="Find the mirror ball in the capture's photo, read the light from it, and "
+        "recover the sample's normal, diffuse, roughness and specular maps.",
+    )
+    refine.add_argument(
+        "capture",
+        type=Path,
+        help="a folder with photo.*, rig.toml and the pattern; 'example' is the one that comes "
+        "with invrender",
+    )
+    refine.add_argument("-o", "--out", type=Path, required=True, help="folder for the results")
+    refine.add_argument("--size", type=int, default=256, help="pixels a side of the maps (256)")
+    refine.add_argument(
+        "--init",
+        choices=["flat"],
+        default="flat",
+        help="where refinement starts; flat: a flat sample, needs no network (default)",
+    )
+    refine.add_argument(
+        "--samples", type=int, default=64, help="samples a pixel of the specular lobe (64)"
+    )
+    refine.add_argument(
+        "--ball",
+        type=_ball,
+        metavar="X,Y,R",
+        help="the ball's centre and radius in photo pixels, if it is not found by itself",
+    )
+    refine.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    refine.add_argument("--json", action="store_true", help="print the report as JSON")
+    refine.set_defaults(run=_refine)
+
+    simulate = commands.add_parser(
+        "simulate",
+        help="render a synthetic capture with its ground truth",
+        description="Path-trace a whole photograph (sample, mirror ball, table) of a material "
+        "under the pattern, and write it as a capture folder.",
+    )
+    simulate.add_argument("-o", "--out", type=Path, required=True, help="new folder to write")
+    simulate.add_argument("--maps", type=Path, help="folder with a material's maps")
+    simulate.add_argument("--kind", help="procedural material instead, e.g. bricks or rust")
+    simulate.add_argument("--environment", type=Path, help="equirectangular EXR or HDR file")
+    simulate.add_argument("--pattern", type=Path, help="pattern image (the default one)")
+    simulate.add_argument("--irradiance", type=float, default=0.5, help="of the room (0.5)")
+    simulate.add_argument("--gain", type=float, default=2.0, help="radiance of white (2)")
+    simulate.add_argument("--size", type=int, default=256, help="pixels a side of the maps (256)")
+    simulate.add_argument("--width", type=int, default=1280, help="of the photo, pixels (1280)")
+    simulate.add_argument("--spp", type=int, default=64, help="path tracer's samples (64)")
+    simulate.add_argument("--noise", type=float, default=0.005, help="of the sensor (0.005)")
+    simulate.add_argument("--seed", type=int, default=0, help="of everything random (0)")
+    simulate.set_defaults(run=_simulate)
+    return parser
+
+
+def _ball(text: str) -> tuple[float, float, float]:
+    try:
+        x, y, r = (float(v) for v in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError("expected three numbers: X,Y,R") from None
+    return x, y, r
+
+
+def _refine(args: argparse.Namespace, console: Console) -> int:
+    from invrender.pipeline import refine_capture
+
+    folder = EXAMPLE if str(args.capture) == "example" else args.capture
+    with console.status("") as status:
+        report = refine_capture(
+            folder,
+            args.out,
+            size=args.size,
+            init=args.init,
+            samples=args.samples,
+            ball=args.ball,
+            progress=lambda stage: status.update(f"{stage} …"),
+        )
+    if args.json:
+        print(json.dumps(report.__dict__))
+        return 0
+    total = sum(report.seconds.values())
+    slowest = sorted(report.seconds.items(), key=lambda kv: -kv[1])[:4]
+    console.print(f"{report.capture} → {args.out} in {total:.1f} s", highlight=False)
+    console.print("  " + ", ".join(f"{k} {v:.1f} s" for k, v in slowest), highlight=False)
+    error = report.photo_error
+    console.print(
+        f"  photo error {error['initial']:.4f} → {error['refined']:.4f}"
+        f" ({'converged' if report.converged else 'not converged'})",
+        highlight=False,
+    )
+    if report.map_error is not None:
+        for name, before in report.map_error["initial"].items():
+            after = report.map_error["refined"][name]
+            console.print(f"  {name:>9} error {before:.4f} → {after:.4f}", highlight=False)
+    for warning in report.warnings:
+        console.print(f"  warning: {warning}", markup=False, highlight=False)
+    return 0
+
+
+def _simulate(args: argparse.Namespace, console: Console) -> int:
+    from invrender.environments import (
+        procedural_environment,
+        read_environment,
+        scale_environment,
+    )
+    from invrender.images import read_image
+    from invrender.materials import procedural_material, read_material, resize_maps
+    from invrender.pattern import default_pattern
+    from invrender.rig import Rig
+    from invrender.simulate import simulate
+
+    if args.size < 1 or args.width < 64 or args.spp < 1:
+        raise InputError("sizes and sample counts must be positive, the photo 64 pixels or wider")
+    if args.maps:
+        maps = resize_maps(read_material(args.maps), args.size, args.size)
+    else:
+        maps = procedural_material(args.seed, args.size, args.size, kind=args.kind)
+    if args.environment:
+        environment = read_environment(args.environment, 256)
+    else:
+        environment = procedural_environment(args.seed, 256)
+    environment = scale_environment(environment, args.irradiance)
+    pattern = read_image(args.pattern) if args.pattern else default_pattern()
+    with console.status("path tracing …"):
+        simulate(
+            args.out, maps, environment, pattern, Rig(),
+            gain=args.gain, width=args.width, spp=args.spp, noise=args.noise, seed=args.seed,
+        )  # fmt: skip
+    console.print(f"wrote {args.out}", highlight=False)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

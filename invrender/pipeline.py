@@ -1,0 +1,207 @@
+"""The main job: a capture folder in, material maps and a report out."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from invrender.ball import find_ball
+from invrender.capture import Capture, Lights, crop_sample, extract_lights, load_capture
+from invrender.errors import InputError
+from invrender.images import Photo, write_exr, write_png
+from invrender.maps import Maps, map_errors, write_maps
+from invrender.materials import resize_maps
+from invrender.rig import Rig
+
+Array = NDArray[np.floating[Any]]
+FINAL_SAMPLES = 256
+
+
+@dataclass
+class Report:
+    """What a run measured; written as ``report.json``."""
+
+    capture: str
+    size: int
+    init: str
+    seconds: dict[str, float]
+    photo_error: dict[str, float]
+    converged: bool
+    history: list[dict[str, float]]
+    capture_fit: dict[str, Any]
+    warnings: list[str]
+    map_error: dict[str, dict[str, float]] | None
+    versions: dict[str, str]
+
+
+def refine_capture(
+    folder: Path,
+    out: Path,
+    *,
+    size: int = 256,
+    init: str = "flat",
+    samples: int = 64,
+    ball: tuple[float, float, float] | None = None,
+    progress: Callable[[str], None] = lambda stage: None,
+) -> Report:
+    """Recover the maps of a capture and write them, with lights, pictures and report, to ``out``.
+
+    size: pixels a side of the maps. init: "flat" (no network). Raises `InputError` for bad input,
+    before anything is written.
+    """
+    folder, out = Path(folder), Path(out)
+    if size < 1:
+        raise InputError(f"the size must be at least one pixel, got {size}")
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out} is a file; choose a folder for the results")
+    seconds: dict[str, float] = {}
+
+    @contextmanager
+    def stage(name: str) -> Iterator[None]:
+        progress(name)
+        began = time.perf_counter()
+        yield
+        seconds[name] = time.perf_counter() - began
+
+    with stage("read"):
+        capture = load_capture(folder)
+    with stage("ball"):
+        found = find_ball(capture.photo, capture.rig, ball)
+    with stage("lights"):
+        lights = extract_lights(capture, found)
+    with stage("crop"):
+        photo = crop_sample(capture.photo, capture.rig, size)
+        clipped = crop_mask(capture.photo, capture.rig, size)
+    with stage("forward model"):
+        # Dr.Jit compiles here; nothing before needs it.
+        from invrender.initial import flat_maps
+        from invrender.lobes import fit_lobes
+        from invrender.refine import lobe_prior, refine
+        from invrender.render import make_scene, prepare, render
+
+        scene = make_scene(capture.rig, lights.pattern, lights.environment, lights.gain)
+        prepared = prepare(scene)
+    with stage("initial maps"):
+        start = flat_maps(photo, prepared, samples)
+    with stage("materials"):
+        lobes = fit_lobes(photo, prepared, samples)
+    with stage("refine"):
+        result = refine(
+            photo,
+            prepared,
+            lobe_prior(lobes),
+            samples=samples,
+            clipped=clipped if clipped.any() else None,
+            progress=lambda i, error: progress(f"refine: step {i}, photo error {error:.4f}"),
+        )
+    with stage("render"):
+        pictures = [
+            render(
+                capture.rig, maps, lights.pattern, lights.environment, lights.gain,
+                samples=FINAL_SAMPLES,
+            )
+            for maps in (start, result.maps)
+        ]  # fmt: skip
+    before, after = (_photo_error(p, photo, clipped) for p in pictures)
+    errors = None
+    if capture.truth is not None:
+        truth = resize_maps(capture.truth, size, size)
+        errors = {"initial": map_errors(start, truth), "refined": map_errors(result.maps, truth)}
+    report = Report(
+        capture=folder.name,
+        size=size,
+        init=init,
+        seconds=seconds,
+        photo_error={"initial": before, "refined": after},
+        converged=result.converged,
+        history=result.history,
+        capture_fit={
+            "ball_centre": list(found.centre),
+            "ball_radius": found.radius,
+            "ball_confidence": found.confidence,
+            "gain": [float(g) for g in lights.gain],
+            **lights.fit,
+        },
+        warnings=_warnings(clipped, result.converged),
+        map_error=errors,
+        versions={n: version(n) for n in ("invrender", "drjit", "mitsuba", "numpy")},
+    )
+    with stage("write"):
+        _write(out, report, capture, lights, result.maps, photo, pictures[1])
+    return report
+
+
+def crop_mask(photo: Photo, rig: Rig, size: int) -> NDArray[np.bool_]:
+    """(size, size): pixels of the sample's crop that a saturated photo pixel touches."""
+    if not photo.clipped.any():
+        return np.zeros((size, size), bool)
+    mask = np.repeat(photo.clipped[..., None].astype(np.float32), 3, -1)
+    wide = ndimage.maximum_filter(mask, (3, 3, 1))
+    return crop_sample(Photo(wide), rig, size, order=1)[..., 0] > 1e-3
+
+
+def _photo_error(picture: Array, photo: Array, clipped: NDArray[np.bool_]) -> float:
+    """RMS difference over the photo's mean, where the photo is not saturated."""
+    seen = ~clipped if not clipped.all() else np.ones_like(clipped)
+    difference = (picture - photo)[seen].astype(np.float64)
+    return float(np.sqrt(np.mean(difference**2)) / max(float(photo[seen].mean()), 1e-12))
+
+
+def _warnings(clipped: NDArray[np.bool_], converged: bool) -> list[str]:
+    warnings = []
+    if clipped.any():
+        warnings.append(
+            f"{clipped.mean():.1%} of the sample is saturated in the photo; the maps keep their "
+            "initial values there: expose for the highlights"
+        )
+    if not converged:
+        warnings.append("refinement had not converged when it reached its step limit")
+    return warnings
+
+
+def _write(
+    out: Path,
+    report: Report,
+    capture: Capture,
+    lights: Lights,
+    maps: Maps,
+    photo: Array,
+    picture: Array,
+) -> None:
+    """Everything goes to a folder beside ``out`` first, so that nothing is ever half-written."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    white = max(float(np.percentile(photo, 99.5)), 1e-12)
+    with tempfile.TemporaryDirectory(dir=out.parent, prefix=".") as name:
+        new = Path(name)
+        write_maps(new, maps)
+        for key, image in maps.encoded().items():
+            write_png(new / f"{key}.png", image, linear=key in ("normal", "roughness"))
+        write_exr(new / "environment.exr", lights.environment)
+        write_exr(new / "pattern.exr", lights.pattern_captured)
+        write_png(new / "photo.png", photo / white)
+        write_png(new / "render.png", picture / white)
+        # Grey where they agree; a tenth of white away from black or white.
+        write_png(new / "difference.png", 0.5 + 5 * (picture - photo) / white, linear=True)
+        (new / "report.json").write_text(json.dumps(report.__dict__, indent=2) + "\n")
+        out.mkdir(exist_ok=True)
+        for file in sorted(new.iterdir()):
+            os.replace(file, out / file.name)
+
+
+def copy_example(folder: Path) -> Path:
+    """The capture that comes with the package, copied to ``folder``."""
+    source = Path(__file__).parent / "data" / "example"
+    return Path(shutil.copytree(source, folder))

@@ -1,0 +1,399 @@
+"""Training captures: (material, room, rig, noise) → what the network sees and should answer.
+
+    python -m nets.data --out DIR --count 4096 --materials DIR --envs DIR
+
+Shards of `SHARD` captures are files shard_NNNNNN.safetensors. Shard i depends on the options, the
+seed and i alone, and appears under its name only when whole: any engine may map `write_shard` over
+the indices, on any number of machines, and again over what is missing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import multiprocessing
+import os
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors.numpy import save_file
+from scipy.ndimage import gaussian_filter, zoom
+
+from invrender.backend import Float, dr, vector
+from invrender.environments import (
+    find_environments,
+    procedural_environment,
+    read_environment,
+    resample_environment,
+    rotate_environment,
+    scale_environment,
+)
+from invrender.errors import InputError
+from invrender.images import read_image
+from invrender.maps import Maps
+from invrender.materials import (
+    augment,
+    check_maps,
+    find_materials,
+    mix,
+    procedural_material,
+    read_material,
+)
+from invrender.render import Material, prepare, radiance
+from invrender.rig import Rig
+from invrender.scene import make_scene, make_view
+from nets.clues import light_inputs, white_level
+from nets.splitsum import area_resize
+
+Array = NDArray[np.floating[Any]]
+Sample = dict[str, Array]
+log = logging.getLogger("invrender")
+
+SHARD = 64
+HOLDOUT = Path(__file__).with_name("holdout.txt")
+RADIANCE = ("photo", "ideal", "env_clues", "active_clues", "sky", "screen", "ball", "pattern")
+FLOOR = 1e-4  # smallest white level of a usable capture, of the screen's white
+
+
+@dataclass(frozen=True)
+class Options:
+    """What is drawn. ``split``: train leaves the held-out names aside, holdout takes only them.
+
+    procedural: share of made-up materials and rooms where folders are given. per_room: captures in
+    the same room with the same rig. pattern: an image file, or the default pattern where empty.
+    """
+
+    size: int = 128
+    samples: int = 32
+    seed: int = 0
+    split: str = "train"
+    materials: str = ""
+    envs: str = ""
+    procedural: float = 0.5
+    per_room: int = 2
+    env_height: int = 64
+    pattern: str = ""
+
+
+# --- lights ---------------------------------------------------------------------------------------
+
+
+def light_pattern(path: str = "", size: int = 128) -> Array:
+    """The pattern (size, size, 3) from a file, or the default one."""
+    if path:
+        return area_resize(np.clip(read_image(Path(path)), 0, 1), size)
+    try:
+        from invrender.pattern import default_pattern  # type: ignore[import-not-found]
+    except ImportError:
+        return placeholder_pattern(size)
+    return np.asarray(default_pattern(size), np.float32)
+
+
+def placeholder_pattern(size: int) -> Array:
+    """Soft blocks of saturated colours, until there is a default pattern."""
+    rng = np.random.default_rng(7)
+    blocks = rng.permutation(np.array([*np.eye(3), *(1 - np.eye(3))] * 3)[:16]).reshape(4, 4, 3)
+    big = np.kron(blocks, np.ones((32, 32, 1)))
+    return area_resize(gaussian_filter(big, (3, 3, 0)).astype(np.float32), size)
+
+
+def holdout_names() -> set[str]:
+    """Names in ``holdout.txt``."""
+    lines = HOLDOUT.read_text().splitlines()
+    return {line.strip() for line in lines if line.strip() and not line.startswith("#")}
+
+
+@lru_cache(maxsize=4)
+def _folder_materials(root: str, split: str) -> tuple[Maps, ...]:
+    """Usable materials of a folder that belong to a split, at most 512² each."""
+    held, out = holdout_names(), []
+    for folder in find_materials(Path(root)) if root else []:
+        if (folder.name in held) != (split == "holdout"):
+            continue
+        try:
+            maps = read_material(folder, 512)
+            check_maps(maps)
+        except (InputError, OSError) as e:
+            log.warning("%s left out: %s", folder, e)
+        else:
+            out.append(maps)
+    return tuple(out)
+
+
+@lru_cache(maxsize=4)
+def _folder_environments(root: str, split: str, height: int) -> tuple[Array, ...]:
+    held, out = holdout_names(), []
+    for path in find_environments(Path(root)) if root else []:
+        if (path.stem in held) != (split == "holdout"):
+            continue
+        try:
+            out.append(read_environment(path, height))
+        except (InputError, OSError) as e:
+            log.warning("%s left out: %s", path, e)
+    return tuple(out)
+
+
+def draw_material(rng: np.random.Generator, options: Options) -> Maps:
+    """A material of size × size, procedural or from the folder, at times two mixed."""
+    real = _folder_materials(options.materials, options.split)
+    n = options.size
+
+    def one() -> Maps:
+        if real and rng.random() >= options.procedural:
+            jitter = 0.0 if options.split == "holdout" else 1.0
+            return augment(real[rng.integers(len(real))], rng, n, n, jitter=jitter)
+        return procedural_material(int(rng.integers(2**62)), n, n)
+
+    for _ in range(20):
+        maps = one()
+        if options.split == "train" and rng.random() < 0.1 and n >= 8:
+            field = gaussian_filter(rng.standard_normal((n, n)), n / rng.uniform(4, 16), mode="wrap")
+            edge = np.clip(0.5 + field / field.std() / rng.uniform(0.02, 0.5), 0, 1)
+            maps = mix(maps, one(), edge.astype(np.float32), float(rng.uniform(-1, 1)))
+        try:
+            check_maps(maps)
+        except InputError:
+            continue
+        return maps
+    raise InputError("twenty degenerate materials in a row")
+
+
+def draw_environment(rng: np.random.Generator, options: Options) -> Array:
+    """A room, turned at random, at a radiance of its own."""
+    real = _folder_environments(options.envs, options.split, options.env_height)
+    if real and rng.random() >= options.procedural:
+        env = real[rng.integers(len(real))]
+    else:
+        env = procedural_environment(int(rng.integers(2**62)), options.env_height)
+    if rng.random() < 0.5:
+        env = env[:, ::-1]
+    return rotate_environment(env, float(rng.uniform(0, 2 * np.pi)))
+
+
+def draw_rigs(rng: np.random.Generator) -> tuple[Rig, Rig]:
+    """(what the user measured, what it really is).
+
+    Only proportions matter to the picture, so the screen's size stays.
+    """
+    d = Rig()
+    known = replace(
+        d,
+        screen_height=d.screen_height * float(np.exp(0.03 * rng.standard_normal())),
+        camera_offset=float(max(d.camera_offset + 0.001 * rng.standard_normal(), 0.01)),
+    )
+    if rng.random() < 0.3:
+        return known, known
+
+    def vector(sigma: float) -> tuple[float, float, float]:
+        x, y, z = sigma * rng.standard_normal(3)
+        return float(x), float(y), float(z)
+
+    wrong = float(rng.uniform(0, 1))
+    true = replace(
+        known,
+        screen_shift=vector(0.0015 * wrong),
+        screen_tilt=vector(0.6 * wrong),
+        camera_shift=vector(0.0015 * wrong),
+    )
+    return known, true
+
+
+def display(rng: np.random.Generator, pattern: Array) -> Array:
+    """What a real screen shows of a pattern: intensity, display curve, white balance."""
+    shown = pattern * np.exp(0.3 * rng.standard_normal())
+    if rng.random() < 0.7:
+        shown = np.clip(shown, 0, None) ** np.exp(0.08 * rng.standard_normal())
+        shown = shown * np.exp(0.06 * rng.standard_normal(3))
+        shown = shown + rng.uniform(0, 0.01) * shown.max()  # black is never black
+    return shown.astype(np.float32)
+
+
+def fit_gain(shown: Array, pattern: Array, rng: np.random.Generator) -> Array:
+    """The RGB gain that a user's software finds for what the screen shows, a little off."""
+    gain = (shown * pattern).sum((0, 1)) / np.maximum((pattern**2).sum((0, 1)), 1e-9)
+    return gain * np.exp(0.01 * rng.standard_normal(3))
+
+
+def capture_pattern(rng: np.random.Generator, shown: Array) -> Array:
+    """What the ball shows of the screen: a mosaic with eroded borders."""
+    n = int(rng.integers(16, 64))
+    small = area_resize(shown, n)
+    if rng.random() < 0.5:
+        border = np.ones((n, n, 1), np.float32)
+        border[0] *= rng.uniform(0, 1)
+        border[-1] *= rng.uniform(0, 1)
+        border[:, 0] *= rng.uniform(0, 1)
+        border[:, -1] *= rng.uniform(0, 1)
+        small = small * border
+    small = small * np.exp(0.02 * rng.standard_normal(small.shape))
+    return np.asarray(zoom(small, (64 / n, 64 / n, 1), order=0, grid_mode=True, mode="nearest"))
+
+
+def captured_environment(rng: np.random.Generator, env: Array, white: float) -> Array:
+    """What the ball shows of the room: coarser, at times clipped, a little off in colour."""
+    height = int(rng.choice([32, 48, 64]))
+    seen = resample_environment(env, height)
+    if rng.random() < 0.3:  # lamps brighter than the photo's white
+        seen = np.minimum(seen, white * np.exp(rng.uniform(np.log(2), np.log(50))))
+    seen = seen * np.exp(0.02 * rng.standard_normal(3)) * np.exp(0.03 * rng.standard_normal())
+    return resample_environment(seen.astype(np.float32), 64)
+
+
+# --- captures -------------------------------------------------------------------------------------
+
+
+def sensor(rng: np.random.Generator, image: Array) -> Array:
+    """A camera's noise, blur and clipping on radiance (H, W, 3)."""
+    if rng.random() < 0.5:
+        image = gaussian_filter(image, (s := rng.uniform(0.2, 0.8), s, 0))
+    top = np.percentile(image, 99.5) * np.exp(rng.uniform(np.log(0.8), np.log(8)))
+    top = max(float(top), 1e-8)
+    electrons = np.exp(rng.uniform(np.log(1500), np.log(60000)))
+    read = np.exp(rng.uniform(np.log(2e-4), np.log(2e-3)))
+    x = np.clip(image / top, 0, None)
+    x = x + np.sqrt(x / electrons + read**2) * rng.standard_normal(image.shape)
+    return (np.clip(x, 0, 1) * top).astype(np.float32)
+
+
+def make_group(rng: np.random.Generator, options: Options) -> list[Sample]:
+    """``per_room`` captures in one room with one rig. Fewer if some come out degenerate."""
+    known, true = draw_rigs(rng)
+    pattern = light_pattern_cached(options.pattern)
+    shown = display(rng, pattern)
+    # Irradiance of the room relative to the screen's, from a dark room to a bright one.
+    ratio = np.exp(rng.uniform(np.log(0.05), np.log(6.0)))
+    level = float(shown.mean()) * 0.7 * ratio  # π times the screen's form factor is about 0.7
+    env = scale_environment(draw_environment(rng, options), level)
+    gain = fit_gain(shown, pattern, rng)
+    captured = capture_pattern(rng, shown)
+    seen = captured_environment(rng, env, float(shown.max()))
+    lights = light_inputs(known, pattern, gain, seen, captured)
+    unit = white_level(lights)
+    if not unit > FLOOR:
+        return []
+
+    size = options.size
+    # Light adds up: the room beside a dark screen, and the screen alone as it is and should be.
+    room = prepare(make_scene(true, np.ones_like(pattern), env, gain=0.0))
+    screens = [prepare(make_scene(true, p, None, g)) for p, g in ((shown, 1.0), (pattern, gain))]
+    out = []
+    for _ in range(options.per_room):
+        maps = draw_material(rng, options)
+        material = _material(maps)
+        view = make_view(room.scene, size, size, seed=int(rng.integers(2**31)))
+        parts = [radiance(p, view, material, options.samples) for p in (room, *screens)]
+        dr.eval(parts)
+        a, b, c = (np.asarray(p).T.reshape(size, size, 3) for p in parts)
+        sample = {"photo": sensor(rng, a + b), "ideal": a + c, **lights}
+        if all(np.isfinite(v).all() for v in sample.values()) and sample["photo"].max() > 0:
+            out.append(_pack(sample, unit, maps))
+    return out
+
+
+def _material(maps: Maps) -> Material:
+    """As `material_from_maps`, but constant maps stay whole, lest they make kernels of their own."""
+    vec3 = vector(Float, 3)
+    rows = lambda image: np.ascontiguousarray(image.reshape(-1, 3).T, np.float32)  # noqa: E731
+    return Material(
+        vec3(rows(maps.diffuse)),
+        vec3(rows(maps.specular)),
+        Float(np.ascontiguousarray(maps.roughness.ravel(), np.float32)),
+        vec3(rows(maps.normal)),
+    )
+
+
+@lru_cache(maxsize=2)
+def light_pattern_cached(path: str) -> Array:
+    return light_pattern(path)
+
+
+def _pack(sample: Sample, unit: float, maps: Maps) -> Sample:
+    """Radiance in units of a white plane as float16, maps as bytes, all channels first."""
+    sample["photo"] = np.moveaxis(sample["photo"], -1, 0)
+    sample["ideal"] = np.moveaxis(sample["ideal"], -1, 0)
+    out = {k: np.clip(sample[k] / unit, 0, 6e4).astype(np.float16) for k in RADIANCE}
+    out["rig"] = sample["rig"].astype(np.float32)
+    normal = maps.normal[..., :2] / 2 + 0.5
+    stacked = [normal, maps.diffuse, maps.roughness[..., None], maps.specular]
+    values = np.clip(np.concatenate(stacked, -1), 0, 1)
+    out["maps"] = np.moveaxis(np.round(values * 255).astype(np.uint8), -1, 0)
+    return {k: np.ascontiguousarray(v) for k, v in out.items()}
+
+
+def captures(options: Options, index: int) -> Iterator[Sample]:
+    """The endless stream of captures that shard ``index`` is cut from."""
+    rng = np.random.default_rng([options.seed, index, options.split == "holdout"])
+    while True:
+        yield from make_group(rng, options)
+
+
+def shard_path(folder: Path, index: int) -> Path:
+    return Path(folder) / f"shard_{index:06d}.safetensors"
+
+
+def write_shard(folder: Path, index: int, options: Options, count: int = SHARD) -> Path:
+    """Write shard ``index`` unless it is there. The work of any engine that maps over indices."""
+    path = shard_path(folder, index)
+    if path.exists():
+        return path
+    stream = captures(options, index)
+    samples = [next(stream) for _ in range(count)]
+    tensors = {k: np.stack([s[k] for s in samples]) for k in samples[0]}
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    save_file(tensors, part, metadata={"options": json.dumps(asdict(options)), "index": str(index)})
+    part.replace(path)
+    return path
+
+
+# --- command line ---------------------------------------------------------------------------------
+
+
+def _work(job: tuple[Path, int, Options, int]) -> tuple[int, float]:
+    start = time.perf_counter()
+    write_shard(*job)
+    return job[1], time.perf_counter() - start
+
+
+def _single_thread() -> None:
+    import torch
+
+    dr.set_thread_count(1)
+    torch.set_num_threads(1)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m nets.data", description=__doc__)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--count", type=int, default=4096, help="captures")
+    parser.add_argument("--first", type=int, default=0, help="index of the first shard")
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    for name, value in asdict(Options()).items():
+        kind = {"choices": ("train", "holdout")} if name == "split" else {"type": type(value)}
+        parser.add_argument(f"--{name.replace('_', '-')}", default=value, **kind)
+    args = parser.parse_args()
+    options = Options(**{k: getattr(args, k) for k in asdict(Options())})
+    args.out.mkdir(parents=True, exist_ok=True)
+    jobs = []
+    for i in range(-(-args.count // SHARD)):
+        count = min(SHARD, args.count - i * SHARD)
+        if not shard_path(args.out, args.first + i).exists():
+            jobs.append((args.out, args.first + i, options, count))
+    context = multiprocessing.get_context("spawn")
+    # A worker is replaced now and then: Dr.Jit's caches grow with the kernels.
+    start, done = time.perf_counter(), 0
+    with context.Pool(args.workers, _single_thread, maxtasksperchild=16) as pool:
+        for index, seconds in pool.imap_unordered(_work, jobs):
+            done += 1
+            rate = done * SHARD / (time.perf_counter() - start)
+            print(f"shard {index}: {seconds:.1f} s; {rate:.2f} captures/s in all", flush=True)
+
+
+if __name__ == "__main__":
+    main()

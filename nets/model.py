@@ -1,0 +1,290 @@
+"""The two-branch network with lighting clues, and its denoiser.
+
+Image encoder → normal decoder → initial normals → normal clues (split-sum, inside the forward
+pass) → clue encoder; both bottlenecks → fusion → material decoder. A batch is a dict of tensors:
+
+    photo (B, 3, H, W) radiance; position (B, 2, H, W) in [-1, 1]², x right, y up; and the light as
+    `nets.clues.light_inputs` gives it, each with a batch axis: env_clues, active_clues, sky,
+    screen, ball, pattern, rig.
+
+All of it may be in any unit of radiance: it is divided by that of a white plane first.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from invrender.errors import InputError
+from nets.blocks import Decoder, Encoder, Pointwise, blocks, pad_to
+from nets.splitsum import (
+    brdf_table,
+    hit_screen,
+    normal_clues,
+    reflect,
+    sample,
+    view_directions,
+)
+
+Batch = dict[str, Tensor]
+
+ALBEDO = 0.6
+BASIS = ((0.2, 0.0), (0.2, 0.6), (0.6, 0.0), (0.6, 0.6))
+CLUES = ("none", "mirrorball", "plane", "colored", "full")
+MAPS = ("normal", "diffuse", "roughness", "specular")
+LIGHTS = ("env_clues", "active_clues", "sky", "screen", "ball", "pattern")
+MIN_SIGMA, MAX_SIGMA = 0.002, 1.0
+
+
+@dataclass(frozen=True)
+class Config:
+    """What is built. ``clues``: none (LPL+), mirrorball (the ball's image instead of clues), plane,
+    full (and normal clues in grey) or colored (those in colour).
+
+    active: clues of the screen's light too, and the ratio of the photo to a white plane.
+    clue_skips: the material decoder also gets the clue encoder's skips. narrow_fusion: halve the
+    channels before the fusion blocks, not after.
+    """
+
+    width: int = 16
+    encoder: tuple[int, ...] = (1, 1, 2, 4)
+    middle: int = 4
+    decoder: tuple[int, ...] = (1, 1, 1, 1)
+    clues: str = "full"
+    active: bool = True
+    clue_skips: bool = True
+    narrow_fusion: bool = True
+    denoiser: bool = False
+
+    def __post_init__(self) -> None:
+        if self.clues not in CLUES:
+            raise InputError(f"clues must be one of {', '.join(CLUES)}, got {self.clues!r}")
+
+
+PRESETS = {
+    "small": Config(),
+    "paper": Config(
+        32, (2, 2, 4, 8), 12, (2, 2, 2, 2),
+        active=False, clue_skips=False, narrow_fusion=False, denoiser=True,
+    ),
+    "tiny": Config(8, (1, 1), 1, (1, 1)),  # for tests
+}  # fmt: skip
+
+
+def encode(x: Tensor) -> Tensor:
+    """Radiance in units of a white plane to about [-1, 1], log-like from 0.02 upwards."""
+    return torch.log2(x.clamp(0, 1e3) + 0.02) * 0.25 + 0.4
+
+
+class Denoiser(nn.Module):
+    """(photo, pattern as captured, pattern as it should be) → the photo under the latter.
+
+    A plain NAFNet on encoded images that adds to its input.
+    """
+
+    def __init__(self, config: Config) -> None:
+        super().__init__()
+        self.encoder = Encoder(9, config.width, config.encoder)
+        self.middle = blocks(config.width << len(config.encoder), config.middle)
+        self.decoder = Decoder(3, config.width, config.decoder)
+
+    def forward(self, photo: Tensor, captured: Tensor, ideal: Tensor) -> Tensor:
+        """Encoded images (B, 3, H, W), H and W multiples of 2^levels."""
+        x, skips = self.encoder(torch.cat([photo, captured, ideal], 1))
+        return photo + self.decoder(self.middle(x), skips)
+
+
+class Network(nn.Module):
+    """See the module's docstring. Returns normal0 and normal (B, 3, H, W) unit; diffuse, specular
+    (B, 3, H, W), roughness (B, 1, H, W), unclamped while training; sigma (B, 4, H, W), the expected
+    error of `MAPS`, normals encoded to [0, 1]; with a denoiser also denoised, encoded.
+    """
+
+    table: Tensor
+    calibration: Tensor
+
+    def __init__(self, config: Config) -> None:
+        super().__init__()
+        self.config = config
+        levels, width = len(config.encoder), config.width
+        self.multiple = 1 << levels
+        deep = width << levels
+        image, clue = _channels(config)
+        self.denoiser = Denoiser(config) if config.denoiser else None
+        self.encoder = Encoder(image, width, config.encoder)
+        self.normal_decoder = Decoder(2, width, config.decoder)
+        self.clue_encoder = Encoder(clue, width, config.encoder) if clue else None
+        both = 2 * deep if clue else deep
+        inside = deep if config.narrow_fusion else both
+        narrow = nn.Conv2d(both, deep, 3, padding=1)
+        steps = [blocks(inside, config.middle), narrow]
+        self.fusion = nn.Sequential(*(reversed(steps) if config.narrow_fusion else steps))
+        self.skips = (
+            nn.ModuleList(Pointwise(width << k, width << k) for k in range(levels))
+            if config.clue_skips and clue
+            else None
+        )
+        self.material_decoder = Decoder(2 + 7 + 4, width, config.decoder)
+        # A fresh network predicts a plane of middling materials, in doubt.
+        with torch.no_grad():
+            self.material_decoder.ending.weight *= 0.1
+            self.normal_decoder.ending.weight *= 0.1
+            self.normal_decoder.ending.bias.zero_()
+            start = [0, 0, *[0.3] * 3, 0.5, *[0.1] * 3, -3, -1.5, -1.5, -2]
+            self.material_decoder.ending.bias.copy_(torch.tensor(start))
+        self.register_buffer("table", brdf_table(), persistent=False)
+        self.register_buffer("calibration", torch.ones(4))
+
+    def forward(self, batch: Batch) -> Batch:
+        height, width = batch["photo"].shape[-2:]
+        batch = normalise(batch, self.config)
+        position = pad_to(batch["position"], self.multiple)
+        photo = pad_to(batch["photo"], self.multiple)
+        rig, pattern = batch["rig"], batch["pattern"]
+
+        # What each pixel would show as a mirror: the pattern as captured.
+        view = view_directions(position, rig)
+        up = torch.zeros_like(view)
+        up[:, 2] = 1
+        st = hit_screen(position, reflect(view, up), rig)
+        mirrored = sample(pattern, st * 2 - 1, "zeros")
+        out: Batch = {}
+        seen = encode(photo)
+        if self.denoiser is not None:
+            ideal = sample(batch["screen"][:, :3], (st * 2 - 1) / 2)
+            seen = out["denoised"] = self.denoiser(seen, encode(mirrored), encode(ideal))
+        active = sample(batch["active_clues"], position)
+        plane = sample(batch["env_clues"], position)
+        inputs = [seen, encode(mirrored), position]
+        if self.config.active:
+            white = active[:, 9:12]
+            if _knows_environment(self.config):
+                white = white + plane[:, 9:12]
+            ratio = photo / (white / ALBEDO + 0.02)
+            inputs += [ratio.clamp(max=4), encode(torch.cat([active[:, :3], active[:, 6:]], 1))]
+
+        x, skips = self.encoder(_last(torch.cat(inputs, 1)))
+        slope0 = self.normal_decoder(x, skips)
+        normal0 = slope_normal(slope0)
+        if self.clue_encoder is not None:
+            clues = self._clues(batch, normal0, position, plane)
+            c, clue_skips = self.clue_encoder(_last(clues))
+            x = torch.cat([x, c], 1)
+            if self.skips is not None:
+                skips = [
+                    s + conv(k) for s, k, conv in zip(skips, clue_skips, self.skips, strict=True)
+                ]
+        y = self.material_decoder(self.fusion(x), skips)
+        y, normal0 = y[..., :height, :width], normal0[..., :height, :width]
+        slope = slope0[..., :height, :width] + y[:, :2]
+        diffuse, roughness, specular = y[:, 2:5], y[:, 5:6], y[:, 6:9]
+        if not self.training:
+            diffuse, specular = diffuse.clamp(0, 1), specular.clamp(0, 1)
+            roughness = roughness.clamp(0.02, 1)
+        sigma = torch.exp(y[:, 9:].clamp(-6.2, 0)) * self.calibration[:, None, None]
+        out |= {"normal0": normal0, "normal": slope_normal(slope), "diffuse": diffuse}
+        out |= {"roughness": roughness, "specular": specular}
+        out["sigma"] = sigma.clamp(MIN_SIGMA, MAX_SIGMA)
+        if "denoised" in out:
+            out["denoised"] = out["denoised"][..., :height, :width]
+        return out
+
+    def _clues(self, batch: Batch, normal: Tensor, position: Tensor, plane: Tensor) -> Tensor:
+        """Input of the clue encoder."""
+        if self.config.clues == "mirrorball":
+            return encode(sample(batch["ball"], position))
+        clues = [encode(plane)]
+        if self.config.clues in ("full", "colored"):
+            screen = batch["screen"] if self.config.active else None
+            images, seen = normal_clues(
+                normal, position, batch["rig"], batch["sky"], screen, self.table, BASIS, ALBEDO
+            )
+            if self.config.clues == "full":
+                b, _, h, w = images.shape
+                images = images.reshape(b, len(BASIS), 3, h, w).mean(2)
+            clues += [encode(images)] + ([] if seen is None else [encode(seen)])
+        return torch.cat(clues, 1)
+
+
+def _knows_environment(config: Config) -> bool:
+    return config.clues not in ("none", "mirrorball")
+
+
+def _channels(config: Config) -> tuple[int, int]:
+    """Input channels of the image encoder and of the clue encoder."""
+    image = 8 + (12 if config.active else 0)
+    lit = 6 if config.active else 0
+    clue = {
+        "none": 0, "mirrorball": 3, "plane": 12, "full": 16 + lit, "colored": 24 + lit,
+    }[config.clues]  # fmt: skip
+    return image, clue
+
+
+def _last(x: Tensor) -> Tensor:
+    return x.contiguous(memory_format=torch.channels_last)
+
+
+def slope_normal(slope: Tensor) -> Tensor:
+    """Unit normals (B, 3, H, W) along (p, q, 1)."""
+    return F.normalize(torch.cat([slope, torch.ones_like(slope[:, :1])], 1), dim=1)
+
+
+def normalise(batch: Batch, config: Config | None = None) -> Batch:
+    """The batch in units of a white plane's mean radiance; what is not finite becomes black."""
+    lights = ["active_clues"]
+    if config is None or _knows_environment(config):
+        lights.append("env_clues")
+    level = torch.stack([batch[k][:, 9:12].mean((1, 2, 3)) for k in lights]).sum(0) / ALBEDO
+    scale = 1 / torch.nan_to_num(level, 1.0).clamp(min=1e-20)
+    out = dict(batch)
+    for key in ("photo", "target", *LIGHTS):
+        if key in batch:
+            x = batch[key] * scale[:, None, None, None]
+            out[key] = torch.nan_to_num(x, 0.0, 1e3, 0.0).clamp(0, 1e4)
+    return out
+
+
+def build(name: str, **changes: Any) -> Network:
+    """A network from `PRESETS`, with fields of `Config` changed, in the channels-last layout."""
+    if name not in PRESETS:
+        raise InputError(f"no preset {name!r}; there are {', '.join(PRESETS)}")
+    network = Network(replace(PRESETS[name], **changes))
+    return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+
+def save_weights(path: Path, network: Network, notes: dict[str, Any], half: bool = False) -> None:
+    """Write safetensors with the `Config` and ``notes`` as JSON in its header."""
+    tensors = {
+        k: (v.half() if half else v).contiguous() for k, v in network.state_dict().items()
+    }
+    metadata = {"config": json.dumps(asdict(network.config)), "notes": json.dumps(notes)}
+    part = path.with_suffix(".part")
+    save_file(tensors, part, metadata=metadata)
+    part.replace(path)
+
+
+def load_weights(path: Path) -> tuple[Network, dict[str, Any]]:
+    """A network in evaluation mode from `save_weights`, and its notes. Raises `InputError`."""
+    try:
+        with safe_open(path, "pt") as f:
+            metadata = f.metadata() or {}
+        fields = json.loads(metadata["config"])
+        config = Config(**{k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()})
+        network = Network(config)
+        network.load_state_dict({k: v.float() for k, v in load_file(path).items()})
+    except (OSError, KeyError, TypeError, ValueError, RuntimeError) as e:
+        raise InputError(f"{path} holds no weights of this program: {e}") from None
+    except Exception as e:  # safetensors has its own error class
+        if type(e).__name__ != "SafetensorError":
+            raise
+        raise InputError(f"{path} is not a safetensors file: {e}") from None
+    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return network.eval(), json.loads(metadata.get("notes", "{}"))
