@@ -19,7 +19,6 @@ from invrender.shading import Shading, Sums, with_tangents
 from invrender.tables import (
     Tables,
     lamp_at,
-    lamp_side,
     screen_cell,
     screen_level,
     sky_irradiance_at,
@@ -29,7 +28,7 @@ from invrender.tables import (
 
 SCREEN_BIAS, SKY_BIAS = 0.0, -0.5  # levels added to a look-up whose footprint is a sample's share
 STEEP_SIDE = 16  # screen cells a side where a normal's horizon cuts the screen
-WIDE = 1.0  # a sample's share of the lobe, in lamps, from which lamps are summed one by one
+WIDE = 0.05  # a sample's share of the lobe, in texels, from which lamps are summed one by one
 
 
 def shade_fast(
@@ -70,11 +69,13 @@ def shade_fast(
         texel = dr.pi / scene.env_height
         alpha = dr.detach(rho * rho)
         wide = alpha * alpha * (4 * dr.pi) > scalar(n_samples) * (WIDE * texel * texel)
-        side = lamp_side(n_samples)
-        stop = side * side * dr.opaque(uint, tables.lamp_count)
+        count = dr.opaque(uint, tables.lamp_count)
+        # Points a side in each lamp: more where the lobe is narrower than the lamp.
+        side = uint(1) + uint(alpha < 2.5 * texel) + uint(alpha < 0.8 * texel)
+        side = side + uint(alpha < 0.4 * texel)
 
         def lamp_irradiance(i: Any) -> list[list[Any]]:
-            d, light = lamp_at(tables, screen, i, side)
+            d, light = lamp_at(tables, screen, i, uint(1))
             return along_normal(light, d)
 
         def lamp_lobe(i: Any) -> list[list[Any]]:
@@ -82,8 +83,8 @@ def shade_fast(
             rows = sums.derive(lambda r, n: _lobe(view, r * r, n, d), rho, normal)
             return [[light * x for x in row] for row in rows]
 
-        sums.run(stop, lamp_irradiance, (0,), "lamp irradiance")
-        sums.run(dr.select(wide, stop, 0), lamp_lobe, (1, 2), "lamp lobes")
+        sums.run(count, lamp_irradiance, (0,), "lamp irradiance")
+        sums.run(dr.select(wide, side * side * count, 0), lamp_lobe, (1, 2), "lamp lobes")
     if tables.screen is not None or tables.sky is not None:
         inv_n = 1 / scalar(n_samples)
 

@@ -9,6 +9,7 @@ pixels of like albedo. Relief widens the lobe that is found.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,103 +24,116 @@ Array = NDArray[np.floating[Any]]
 Labels = NDArray[np.intp]
 ROUGHNESS = np.array([0.05, 0.1, 0.16, 0.23, 0.32, 0.42, 0.55, 0.7, 0.85, 1.0])
 SPREAD = 0.25  # of ρ around its usual value
-SPREAD_F0 = (0.02, 0.1)  # of k_s: as usual, or anything
-UNUSUAL_F0 = 6  # by how much -2 log-likelihood must fall for a lobe of another f0
+SPREAD_F0 = (0.005, 0.1)  # of k_s: a lobe as usual, or any
+UNUSUAL = 3.0  # by how much -2 log-likelihood must fall for another than a lobe as usual
+LEAST_F0 = 0.02  # of common materials
+METAL = 0.2  # f0 from which a material may be bare metal
 FIT_SIZE = 128  # pixels a side of the fit: what decides is as wide as the pattern's features
 MEASUREMENTS = 100.0  # that a photo's worth of pixels counts for: texture repeats
 MATERIALS, ROUNDS = 4, 2
+
+
+@dataclass(frozen=True)
+class Lobe:
+    """Roughness (an index into `ROUGHNESS`), f0 (3,), and whether light is scattered besides."""
+
+    rho: int
+    f0: Array
+    scatters: bool = True
+
+    def diffuse(self, photo: Array, terms: Any) -> Array:
+        """What the lobe leaves of the photo, as diffuse albedo."""
+        return diffuse_rest(photo, terms, self.f0) * np.float32(self.scatters)
 
 
 def fit_lobes(photo: Array, prepared: Tables | Unbiased, samples: int = 64) -> Maps:
     """Maps of a flat sample with up to `MATERIALS` lobes for a photo (H, W, 3), linear radiance."""
     height, width = photo.shape[:2]
     h, w = min(FIT_SIZE, height), min(FIT_SIZE, width)
-    rows = ((np.arange(h) + 0.5) / h * height).astype(int)
-    columns = ((np.arange(w) + 0.5) / w * width).astype(int)
+    rows, columns = _centres(h, height), _centres(w, width)
     small = photo[np.ix_(rows, columns)]
     terms = [plane_terms(prepared, h, w, float(rho), samples) for rho in ROUGHNESS]
-    everywhere = np.ones((h, w), bool)
-    lobe = np.full((h, w), -1)
-    usual = USUAL_ROUGHNESS, np.full(3, USUAL_SPECULAR)
-    rho, k_s = _fit(small, terms, everywhere, usual, MEASUREMENTS)
-    lobe[:], f0 = rho, np.broadcast_to(k_s, (h, w, 3)).copy()
-    albedo = _diffuse(small, terms, lobe, f0)
-    label, centres = np.zeros((h, w), np.intp), np.zeros((1, 3))
-    for _ in range(ROUNDS):
-        label, centres = _group(albedo)
-        for k in range(len(centres)):
-            of = label == k
-            if of.any():
-                whole = float(ROUGHNESS[rho]), k_s
-                lobe[of], f0[of] = _fit(small, terms, of, whole, MEASUREMENTS * of.mean())
-        albedo = _diffuse(small, terms, lobe, f0)
 
-    # To full size: each pixel takes the lobe of the group to which its albedo belongs.
-    near = np.ix_(
-        np.minimum((np.arange(height) * h) // height, h - 1),
-        np.minimum((np.arange(width) * w) // width, w - 1),
-    )
-    roughness, specular = ROUGHNESS[lobe][near].astype(np.float32), f0[near].astype(np.float32)
-    diffuse = np.zeros_like(photo, dtype=np.float32)
-    for rho in np.unique(lobe):
-        of = roughness == np.float32(ROUGHNESS[rho])
-        full = plane_terms(prepared, height, width, float(ROUGHNESS[rho]), samples)
-        diffuse[of] = diffuse_rest(photo, full, specular)[of]
+    usual = Lobe(int(np.abs(ROUGHNESS - USUAL_ROUGHNESS).argmin()), np.full(3, USUAL_SPECULAR))
+    whole = _fit(small, terms, np.ones((h, w), bool), usual)
+    label, lobes = np.zeros((h, w), np.intp), [whole]
+    for _ in range(ROUNDS):
+        label = _group(_select(label, [f.diffuse(small, terms[f.rho]) for f in lobes]))
+        lobes = [_fit(small, terms, label == k, whole) for k in range(int(label.max()) + 1)]
+
+    # To full size: each pixel takes the lobe of the fitted pixel that it lies in.
+    label = label[np.ix_(_centres(height, h), _centres(width, w))]
+    full = {
+        rho: plane_terms(prepared, height, width, float(ROUGHNESS[rho]), samples)
+        for rho in {f.rho for f in lobes}
+    }
     normal = np.zeros((height, width, 3), np.float32)
     normal[..., 2] = 1
-    return Maps(diffuse, specular, roughness, normal)
+    return Maps(
+        _select(label, [f.diffuse(photo, full[f.rho]) for f in lobes]),
+        np.array([f.f0 for f in lobes], np.float32)[label],
+        ROUGHNESS[[f.rho for f in lobes]].astype(np.float32)[label],
+        normal,
+    )
 
 
-def _diffuse(photo: Array, terms: list[Any], lobe: Labels, f0: Array) -> Array:
-    albedo = np.zeros_like(photo)
-    for k in np.unique(lobe):
-        of = lobe == k
-        albedo[of] = diffuse_rest(photo, terms[k], f0)[of]
-    return albedo
+def _centres(n: int, of: int) -> Labels:
+    """Which of ``of`` pixels hold the centres of n that span the same length."""
+    return ((np.arange(n) + 0.5) / n * of).astype(np.intp)
 
 
-def _group(albedo: Array) -> tuple[Labels, Array]:
+def _select(label: Labels, images: list[Array]) -> Array:
+    """The pixels of the image that each label names."""
+    out = images[0].copy()
+    for k, image in enumerate(images[1:], 1):
+        out[label == k] = image[label == k]
+    return out
+
+
+def _group(albedo: Array) -> Labels:
     """Labels (H, W) of pixels of like albedo, by k-means on its square root."""
     points = np.sqrt(albedo.reshape(-1, 3)).astype(np.float64)
     if len(np.unique(points.round(3), axis=0)) < 10 * MATERIALS:
-        return np.zeros(albedo.shape[:2], np.intp), points[:1]
-    centres, label = kmeans2(points, MATERIALS, minit="++", rng=np.random.default_rng(0))
-    return label.reshape(albedo.shape[:2]), centres
+        return np.zeros(albedo.shape[:2], np.intp)
+    _, label = kmeans2(points, MATERIALS, minit="++", rng=np.random.default_rng(0))
+    return np.unique(label, return_inverse=True)[1].reshape(albedo.shape[:2])
 
 
-def _fit(
-    photo: Array, terms: list[Any], of: Any, usual: tuple[float, Array], measurements: float
-) -> tuple[int, Array]:
-    """Index of the roughness and f0 (3,) of the pixels ``of``, drawn to the usual."""
-    pixels = photo[of]
+def _fit(photo: Array, terms: list[Any], of: NDArray[np.bool_], usual: Lobe) -> Lobe:
+    """The lobe of the pixels ``of``: as usual, of another f0, or bare metal."""
+    measurements = MEASUREMENTS * float(of.mean())
+    pixels = photo[of].astype(np.float64)
     level = photo.mean((0, 1)) + 1e-12
     weight = 1 / np.sqrt(level * (pixels + 0.1 * level))
     n = len(ROUGHNESS)
-    # Two hypotheses: a lobe as usual, or any f0. -2 log-likelihood of each at each roughness.
-    cost, f0 = np.zeros((2, n)), np.zeros((2, n, 3))
+    residual, f0 = np.zeros((3, n)), np.zeros((3, n, 3))
     for i, (e, b, a) in enumerate(terms):
         for c in range(3):
             w = weight[:, c]
             x, y, z = w * e[of][:, c] / np.pi, w * b[of][:, c], w * (pixels[:, c] - a[of][:, c])
             variance = _least_squares(x, y, z, 0.0, 0.0)[1]
-            for k, spread in enumerate(SPREAD_F0):
-                pull = variance / measurements / spread**2
-                f0[k, i, c], residual = _least_squares(x, y, z, pull, float(usual[1][c]))
-                cost[k, i] += residual / 3
-    cost = measurements * np.log(cost + 1e-9) + ((ROUGHNESS - usual[0]) / SPREAD) ** 2
-    cost[1] += UNUSUAL_F0
-    k, best = np.unravel_index(np.argmin(cost), cost.shape)
-    return int(best), f0[k, best]
+            pulls = [variance / measurements / s**2 for s in SPREAD_F0]
+            fits = [_least_squares(x, y, z, pull, float(usual.f0[c])) for pull in pulls]
+            fits.append(_least_squares(0 * x, y, z, 0.0, 0.0))
+            for k in range(3):
+                f0[k, i, c] = fits[k][0]
+                residual[k, i] += fits[k][1] / 3
+    cost = measurements * np.log(residual + 1e-9)
+    cost += ((ROUGHNESS - ROUGHNESS[usual.rho]) / SPREAD) ** 2
+    cost[1:] += UNUSUAL
+    cost[2, f0[2].mean(-1) < METAL] = np.inf
+    k, rho = np.unravel_index(np.argmin(cost), cost.shape)
+    return Lobe(int(rho), f0[k, rho], scatters=bool(k != 2))
 
 
 def _least_squares(x: Array, y: Array, z: Array, pull: float, usual: float) -> tuple[float, float]:
-    """k_s of z ≈ k_d·x + k_s·y with both in [0, 1], and the mean squared residual.
+    """k_s of z ≈ k_d·x + k_s·y with k_d in [0, 1], k_s from `LEAST_F0`; mean squared residual.
 
     pull: weight of (k_s - usual)².
     """
     xx, xy, xz = (x * x).mean() + 1e-20, (x * y).mean(), (x * z).mean()
     yy, yz = (y * y).mean() + pull + 1e-20, (y * z).mean() + pull * usual
     k_d = np.clip((yy * xz - xy * yz) / max(xx * yy - xy * xy, 1e-30), 0, 1)
-    k_s = float(np.clip((yz - xy * k_d) / yy, 0, 1))
+    k_s = float(np.clip((yz - xy * k_d) / yy, LEAST_F0, 1))
     k_d = np.clip((xz - xy * k_s) / xx, 0, 1)
     return k_s, float(((z - k_d * x - k_s * y) ** 2).mean())

@@ -21,7 +21,7 @@ SCREEN_TEXELS = 256  # at least so many a side on the screen, so that its edge i
 T_SIZE = 32  # normals a side in the table of T
 T_EXTENT = 1.1  # of its square beyond the unit disc, so that the rim is interpolated too
 V_SIZE = 16  # sample points a side in the table of V
-SKY_TEXELS = 2  # of the disc a side for each row of the environment
+SKY_TEXELS = 4  # of the disc a side for each row of the environment
 QUAD = 32  # screen cells a side in V's quadrature
 
 
@@ -120,27 +120,20 @@ def _split_lamps(tables: Tables) -> None:
     without = replace(scene, environment=rest)
 
     n = min(SKY_TEXELS * _power_of_two(h), 1024)
-    sub = 2  # 2 × 2 sub-texels, each a bilinear look-up
     x, y = _grid(uint, scalar, n)
-    total = vec4(0)
-    total_lit = vec4(0)
-    for i in range(sub * sub):
-        px = x * 2 - 1 + ((i % sub + 0.5) / sub - 0.5) * (2 / n)
-        py = 1 - y * 2 + ((i // sub + 0.5) / sub - 0.5) * (2 / n)
-        inside = px * px + py * py < 1
-        d = disc_direction(dr.select(inside, px, 0), dr.select(inside, py, 0), vec3)
-        hidden, _ = _corner_hits(dr.detach(scene), d, 0)
-        shown = inside & ~hidden
+    px, py = x * 2 - 1, 1 - y * 2
+    inside = px * px + py * py < 1
+    d = disc_direction(dr.select(inside, px, 0), dr.select(inside, py, 0), vec3)
+    hidden, _ = _corner_hits(dr.detach(scene), d, 0)
+
+    def pyramid(lit: Scene) -> Pyramid:
+        seen = dr.select(inside & ~hidden, environment_at(lit, d), 0)
         cover = dr.select(inside & hidden, scalar(0), 1)
-        seen = dr.select(shown, environment_at(without, d), 0)
-        total += vec4(seen.x, seen.y, seen.z, cover)
-        if len(hot):
-            seen = dr.select(shown, environment_at(scene, d), 0)
-            total_lit += vec4(seen.x, seen.y, seen.z, cover)
-    tables.sky = Pyramid.build(total / (sub * sub), n)
+        return Pyramid.build(vec4(seen.x, seen.y, seen.z, cover), n)
+
+    tables.sky = pyramid(without)
     if len(hot):
-        lit = Pyramid.build(total_lit / (sub * sub), n)
-        tables.sky = Pyramid(dr.concat((tables.sky.texels, lit.texels)), n)
+        tables.sky = Pyramid(dr.concat((tables.sky.texels, pyramid(scene).texels)), n)
 
 
 def _corner_hits(scene: Scene, d: Any, margin: float) -> tuple[Any, Any]:
@@ -169,24 +162,22 @@ def _corner_hits(scene: Scene, d: Any, margin: float) -> tuple[Any, Any]:
 
 
 def _lamp_points(tables: Tables, hot: np.ndarray) -> None:
-    """Precompute each lamp's points: 1, 4, 9 and 16 strata of its bilinear tent.
+    """Precompute each lamp's points: Gauss's rule for its bilinear tent, 1 to 4 points a side.
 
-    A point: direction and solid angle, then the half-widths of a tent, in radians along θ and φ,
-    that has the stratum's variance.
+    A point: direction and solid angle, then half-widths in radians along θ and φ, for the screen's
+    edge to cover it bit by bit.
     """
     scene = tables.scene
     scalar = scene.scalar
     h = scene.env_height
     blocks = []
-    for side in range(1, LAMP_SIDES + 1):
-        strata = (np.arange(side) + 0.5) / side
-        tent = np.where(strata < 0.5, np.sqrt(2 * strata) - 1, 1 - np.sqrt(2 - 2 * strata))
-        width = np.sqrt(1 - 6 * np.mean(tent**2)) * np.pi / h
-        theta = (hot[:, None, None] // (2 * h) + 0.5 + tent[None, :, None]) * (np.pi / h)
-        phi = (hot[:, None, None] % (2 * h) + 0.5 + tent[None, None, :]) * (np.pi / h)
+    for nodes, weights in (_gauss_tent(side) for side in range(1, LAMP_SIDES + 1)):
+        width = np.pi / h / len(nodes)
+        theta = (hot[:, None, None] // (2 * h) + 0.5 + nodes[None, :, None]) * (np.pi / h)
+        phi = (hot[:, None, None] % (2 * h) + 0.5 + nodes[None, None, :]) * (np.pi / h)
         theta, phi = np.broadcast_arrays(theta, phi)
         sin = np.abs(np.sin(theta))
-        weight = sin * (np.pi / h) ** 2 / side**2
+        weight = sin * (np.pi / h) ** 2 * (weights[:, None] * weights)
         direction = [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)]
         zero = np.zeros_like(theta)
         point = [*direction, weight, zero + width, width * np.maximum(sin, 1e-3), zero, zero]
@@ -194,10 +185,15 @@ def _lamp_points(tables: Tables, hot: np.ndarray) -> None:
     tables.lamp_points = scalar(np.concatenate(blocks))
 
 
-def lamp_side(samples: Any) -> Any:
-    """Points a side that each lamp is split into, for a number of specular samples."""
-    scalar = dr.float32_array_t(type(samples))
-    return dr.clip(type(samples)(dr.sqrt(scalar(samples)) * (1 / 16)), 1, LAMP_SIDES)
+def _gauss_tent(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes and weights of the n-point Gauss rule for the weight 1 - |x| on [-1, 1]."""
+    # Golub and Welsch: the recurrence's coefficients from the moments 2/((k+1)(k+2)), k even.
+    moments = [0 if k % 2 else 2 / ((k + 1) * (k + 2)) for k in range(2 * n + 1)]
+    hankel = np.array([[moments[i + j] for j in range(n + 1)] for i in range(n + 1)])
+    r = np.linalg.cholesky(hankel).T
+    off = [r[k + 1, k + 1] / r[k, k] for k in range(n - 1)]
+    nodes, vectors = np.linalg.eigh(np.diag(off, 1) + np.diag(off, -1))
+    return nodes, vectors[0] ** 2
 
 
 def lamp_at(tables: Tables, screen: ScreenFrame | None, i: Any, side: Any) -> tuple[Any, Any]:

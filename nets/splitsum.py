@@ -66,7 +66,7 @@ def _lobe(cos: Array, roughness: float | None, texel: float = 0.0) -> Array:
     """
     if roughness is None:
         return np.maximum(cos, 0)
-    a2 = roughness**4 + (0.3 * texel) ** 2 + 1e-6
+    a2 = roughness**4 + (0.4 * texel) ** 2 + 1e-6
     h2 = np.clip((1 + cos) / 2, 0, 1)  # cos² of the half vector's angle
     return np.maximum(cos, 0) * a2 / (a2 * h2 + 1 - h2) ** 2
 

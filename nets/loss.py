@@ -1,0 +1,74 @@
+"""What is minimised, and what is measured."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from nets.model import MAPS, Batch, Config, encode, normalise
+
+# Spread of each map over the training data: the error of a constant guess. Errors are measured in
+# it, so that normals (small) and roughness (smooth) weigh as much as albedos from the start.
+SPREAD = {"normal": 0.10, "diffuse": 0.22, "roughness": 0.24, "specular": 0.18}
+NORMAL0_WEIGHT = 0.5
+DENOISED_WEIGHT = 0.5
+SIGMA_WEIGHT = 0.1
+
+
+def truth(batch: Batch) -> dict[str, Tensor]:
+    """Maps as errors are measured, normals encoded to [0, 1], from a batch's bytes."""
+    maps = batch["maps"].float() / 255
+    xy = maps[:, :2] * 2 - 1
+    z = torch.sqrt((1 - (xy**2).sum(1, keepdim=True)).clamp(min=1e-4))
+    n = torch.cat([xy, z], 1)
+    n = n / n.norm(dim=1, keepdim=True)
+    return {
+        "normal": n / 2 + 0.5,
+        "diffuse": maps[:, 2:5],
+        "roughness": maps[:, 5:6],
+        "specular": maps[:, 6:9],
+    }
+
+
+def predicted(out: Batch) -> dict[str, Tensor]:
+    """The network's maps in the same encoding."""
+    return {k: out[k] / 2 + 0.5 if k == "normal" else out[k] for k in MAPS}
+
+
+def compare(out: Batch, batch: Batch) -> dict[str, tuple[Tensor, Tensor]]:
+    """Squared error and |error| / sigma of each map, both of the map's shape."""
+    a, b = predicted(out), truth(batch)
+    result = {}
+    for i, k in enumerate(MAPS):
+        error = a[k] - b[k]
+        result[k] = error**2, error.abs() / out["sigma"][:, i : i + 1]
+    return result
+
+
+def total_loss(out: Batch, batch: Batch, config: Config) -> tuple[Tensor, dict[str, float]]:
+    """The loss and its parts as numbers.
+
+    Per map: mean |error| and mean squared error in units of `SPREAD`; L1 on the initial normals;
+    the Gaussian negative log-likelihood of sigma given the error, which does not move the maps.
+    """
+    a, b = predicted(out), truth(batch)
+    parts: dict[str, Tensor] = {}
+    sigma_loss = torch.zeros((), device=out["sigma"].device)
+    for i, k in enumerate(MAPS):
+        error = (a[k] - b[k]) / SPREAD[k]
+        parts[k] = 0.5 * error.abs().mean() + 0.5 * (error**2).clamp(max=16).mean()
+        sigma = out["sigma"][:, i : i + 1]
+        square = ((a[k] - b[k]).detach() / sigma) ** 2
+        # Beyond some sigmas it grows like the error, so that outliers do not rule.
+        robust = torch.where(square < 9, square, 6 * torch.sqrt(square.clamp(min=9)) - 9)
+        sigma_loss = sigma_loss + (0.5 * robust + torch.log(sigma)).mean() + math.log(50)
+    error = (out["normal0"] / 2 + 0.5 - b["normal"]) / SPREAD["normal"]
+    parts["normal0"] = NORMAL0_WEIGHT * error.abs().mean()
+    parts["sigma"] = SIGMA_WEIGHT * sigma_loss
+    if "denoised" in out:
+        ideal = encode(normalise({**batch, "target": batch["ideal"].float()}, config)["target"])
+        parts["denoised"] = DENOISED_WEIGHT * 10 * (out["denoised"] - ideal).abs().mean()
+    total = torch.stack(list(parts.values())).sum()
+    return total, {k: float(v.detach()) for k, v in parts.items()} | {"loss": float(total.detach())}

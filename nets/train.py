@@ -1,0 +1,329 @@
+"""Train a network on shards of captures.
+
+    python -m nets.train --data DIR --out DIR [--valid NAME=DIR ...] [--preset small] [--steps N]
+    torchrun --nproc-per-node 4 -m nets.train ...
+
+Writes log.csv (a line of validation each time), curve.png, last.safetensors with the state to go on
+from, and weights.safetensors, the running mean of the weights, which `nets.infer` loads. Started
+again with the same --out it goes on where it stopped; the same seed and data give the same result.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import math
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
+
+from nets.loader import batches, read_batch, shards
+from nets.loss import SPREAD, compare, total_loss
+from nets.model import CLUES, MAPS, PRESETS, Batch, Network, build, load_weights, save_weights
+
+EMA_DECAY = 0.999
+
+
+def learning_rate(step: int, steps: int, peak: float, last: float = 1e-7, warm: int = 200) -> float:
+    """Linear to ``peak`` within ``warm`` steps, then half a cosine to ``last``."""
+    if step < warm:
+        return peak * (step + 1) / warm
+    x = min((step - warm) / max(steps - warm, 1), 1)
+    return last + (peak - last) * 0.5 * (1 + math.cos(math.pi * x))
+
+
+class Trainer:
+    """Network, optimiser, mean weights and their state on disk."""
+
+    def __init__(self, network: Network, out: Path, device: torch.device, decay: float) -> None:
+        self.out, self.device = out, device
+        self.network = network.to(device)
+        self.module: nn.Module = self.network
+        if torch.distributed.is_initialized():
+            self.module = DistributedDataParallel(self.network)
+        self.optimiser = torch.optim.AdamW(
+            self.network.parameters(), lr=1e-3, betas=(0.9, 0.9), weight_decay=decay
+        )
+        self.mean = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
+        self.step = self.skipped = 0
+        self.seconds = 0.0
+
+    def update(self, batch: Batch, rate: float) -> dict[str, float]:
+        """One step. A step whose loss or gradient is not finite changes nothing but a counter."""
+        self.module.train()
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate
+        self.optimiser.zero_grad(set_to_none=True)
+        loss, parts = total_loss(self.module(batch), batch, self.network.config)
+        loss.backward()
+        norm = nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+        self.step += 1
+        if not torch.isfinite(norm) or not torch.isfinite(loss):
+            self.skipped += 1
+            return parts
+        self.optimiser.step()
+        decay = min(EMA_DECAY, (1 + self.step) / (10 + self.step))
+        with torch.no_grad():
+            for k, v in self.network.state_dict().items():
+                self.mean[k].lerp_(v, 1 - decay) if v.is_floating_point() else None
+        return parts
+
+    def save(self, notes: dict[str, Any]) -> None:
+        """State to go on from (last.safetensors) and the mean weights."""
+        state = {f"weights.{k}": v for k, v in self.network.state_dict().items()}
+        state |= {f"mean.{k}": v for k, v in self.mean.items()}
+        names = [k for k, _ in self.network.named_parameters()]
+        for i, s in self.optimiser.state_dict()["state"].items():
+            state |= {f"adam.{names[i]}.{k}": torch.as_tensor(v) for k, v in s.items()}
+        metadata = {"step": self.step, "skipped": self.skipped, "seconds": self.seconds}
+        part = self.out / "last.part"
+        save_file(
+            {k: v.detach().cpu().contiguous() for k, v in state.items()},
+            part,
+            {k: str(v) for k, v in metadata.items()},
+        )
+        part.replace(self.out / "last.safetensors")
+        with self.averaged() as network:
+            save_weights(self.out / "weights.safetensors", network, notes)
+
+    def resume(self) -> bool:
+        """Take up the state in ``out``; False where there is none."""
+        path = self.out / "last.safetensors"
+        if not path.exists():
+            return False
+        with safe_open(path, "pt") as f:
+            metadata = f.metadata()
+        state = load_file(path)
+        self.step, self.skipped = int(metadata["step"]), int(metadata["skipped"])
+        self.seconds = float(metadata["seconds"])
+        pick = lambda prefix: {  # noqa: E731
+            k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)
+        }
+        self.network.load_state_dict(pick("weights."))
+        self.mean = {k: v.to(self.device) for k, v in pick("mean.").items()}
+        adam = self.optimiser.state_dict()
+        names = [k for k, _ in self.network.named_parameters()]
+        keys = ("step", "exp_avg", "exp_avg_sq")
+        adam["state"] = {
+            i: {k: state[f"adam.{name}.{k}"] for k in keys}
+            for i, name in enumerate(names)
+            if f"adam.{name}.step" in state
+        }
+        self.optimiser.load_state_dict(adam)
+        return True
+
+    def averaged(self) -> _Averaged:
+        """The network with its mean weights, inside a ``with`` block."""
+        return _Averaged(self)
+
+
+class _Averaged:
+    def __init__(self, trainer: Trainer) -> None:
+        self.trainer = trainer
+
+    def __enter__(self) -> Network:
+        network = self.trainer.network
+        self.own = {k: v.detach().clone() for k, v in network.state_dict().items()}
+        network.load_state_dict(self.trainer.mean)
+        return network.eval()
+
+    def __exit__(self, *_: object) -> None:
+        self.trainer.network.load_state_dict(self.own)
+
+
+@torch.no_grad()
+def validate(
+    network: Network, folder: Path, device: torch.device, batch: int = 8, limit: int = 256
+) -> dict[str, float]:
+    """RMSE of each map over all pixels and captures of a folder's first shards together, their
+    average; coverage_X, the share of the true values within one sigma; scale_X, the factor on sigma
+    that makes it 68%."""
+    network.eval()
+    squares = dict.fromkeys(MAPS, 0.0)
+    inside: dict[str, list[Tensor]] = {k: [] for k in MAPS}
+    seen = 0
+    for path in shards(folder):
+        for b in read_batch(path, batch):
+            b = {k: v.to(device) for k, v in b.items()}
+            errors = compare(network(b), b)
+            for k, (square, ratio) in errors.items():
+                squares[k] += float(square.double().mean((1, 2, 3)).sum())
+                inside[k].append(ratio[..., ::4, ::4].flatten().cpu())
+            seen += len(b["photo"])
+            if seen >= limit:
+                break
+        if seen >= limit:
+            break
+    out = {k: math.sqrt(squares[k] / max(seen, 1)) for k in MAPS}
+    out["average"] = sum(out.values()) / len(MAPS)
+    for k in MAPS:
+        ratio = torch.cat(inside[k])
+        out[f"coverage_{k}"] = float((ratio < 1).float().mean())
+        out[f"scale_{k}"] = float(ratio.kthvalue(max(1, int(0.68 * len(ratio)))).values)
+    return out
+
+
+def baseline(folder: Path, limit: int = 256) -> dict[str, float]:
+    """RMSE of the best constant guess for a folder's captures: each map channel's mean."""
+    values = []
+    for path in shards(folder):
+        values += [b["maps"].float() / 255 for b in read_batch(path, 64)]
+        if sum(len(v) for v in values) >= limit:
+            break
+    maps = torch.cat(values)[:limit].double()
+    nz = torch.sqrt((1 - ((maps[:, :2] * 2 - 1) ** 2).sum(1, keepdim=True)).clamp(min=0))
+    maps = torch.cat([maps[:, :2], nz / 2 + 0.5, maps[:, 2:]], 1)
+    variance = maps.transpose(0, 1).flatten(1).var(1)
+    ranges = {"normal": (0, 3), "diffuse": (3, 6), "roughness": (6, 7), "specular": (7, 10)}
+    out = {k: float(variance[a:b].mean().sqrt()) for k, (a, b) in ranges.items()}
+    return {**out, "average": sum(out.values()) / 4}
+
+
+def train(args: argparse.Namespace) -> Trainer:
+    """Run a training as the command line describes it."""
+    distributed = "RANK" in os.environ
+    rank, world = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
+    device = torch.device(args.device)
+    if distributed:
+        torch.distributed.init_process_group("nccl" if device.type == "cuda" else "gloo")
+        if device.type == "cuda":
+            device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
+            torch.cuda.set_device(device)
+    if args.threads:
+        torch.set_num_threads(args.threads)
+    torch.manual_seed(args.seed)
+    changes: dict[str, Any] = {"clues": args.clues} if args.clues else {}
+    for name in ("active", "denoiser"):
+        if (value := getattr(args, name)) is not None:
+            changes[name] = value == "on"
+    args.out.mkdir(parents=True, exist_ok=True)
+    trainer = Trainer(build(args.preset, **changes), args.out, device, args.decay)
+    if args.weights:
+        trainer.network.load_state_dict(load_weights(args.weights)[0].state_dict())
+        trainer.mean = {k: v.detach().clone() for k, v in trainer.network.state_dict().items()}
+    resumed = trainer.resume()
+    valid = dict(v.split("=", 1) for v in args.valid)
+    if rank == 0:
+        (args.out / "options.json").write_text(json.dumps(vars(args), default=str, indent=1))
+        print(f"{'resumed at' if resumed else 'starting from'} step {trainer.step}", flush=True)
+    stream = batches(
+        args.data, args.batch, args.crop, args.seed, start=trainer.step, rank=rank, world=world
+    )
+    run(trainer, stream, args, {k: Path(v) for k, v in valid.items()}, rank)
+    return trainer
+
+
+def run(
+    trainer: Trainer,
+    stream: Iterator[Batch],
+    args: argparse.Namespace,
+    valid: dict[str, Path],
+    rank: int,
+) -> None:
+    """Steps until ``args.steps``; validates and saves every ``args.every``."""
+    sums: dict[str, float] = {}
+    count = 0
+    start = time.perf_counter()
+    while trainer.step < args.steps:
+        batch = {k: v.to(trainer.device) for k, v in next(stream).items()}
+        rate = learning_rate(trainer.step, args.steps, args.rate, args.last_rate)
+        parts = trainer.update(batch, rate)
+        count += 1
+        for k, v in parts.items():
+            sums[k] = sums.get(k, 0.0) + v
+        if trainer.step % args.every and trainer.step < args.steps:
+            continue
+        trainer.seconds += time.perf_counter() - start
+        if rank == 0:
+            means = {k: v / count for k, v in sums.items()}
+            row = {"step": trainer.step, "seconds": trainer.seconds, "skipped": trainer.skipped}
+            row |= {f"train_{k}": v for k, v in means.items()}
+            scales = []
+            with trainer.averaged() as network:
+                for name, folder in valid.items():
+                    result = validate(network, folder, trainer.device)
+                    row |= {f"{name}_{k}": v for k, v in result.items()}
+                    scales.append([result[f"scale_{k}"] for k in MAPS])
+            append_log(args.out / "log.csv", row)
+            if scales:  # the network's own stays at one; that of the mean weights is what is used
+                trainer.mean["calibration"] = torch.tensor(scales).mean(0).to(trainer.device)
+            trainer.save({"hours": trainer.seconds / 3600, **row})
+            trainer.mean["calibration"] = torch.ones(4, device=trainer.device)
+            shown = {k: v for k, v in row.items() if not k.count("scale_") + k.count("coverage_")}
+            print(" ".join(f"{k} {v:.4g}" for k, v in shown.items()), flush=True)
+            plot_log(args.out / "log.csv", args.out / "curve.png")
+        sums, count, start = {}, 0, time.perf_counter()
+
+
+def append_log(path: Path, row: dict[str, float]) -> None:
+    """Add a line to a CSV, with a header where the file is new."""
+    new = not path.exists()
+    with open(path, "a", newline="") as f:
+        writer = csv.writer(f)
+        if new:
+            writer.writerow(row)
+        writer.writerow([f"{v:.6g}" for v in row.values()])
+
+
+def plot_log(path: Path, out: Path) -> None:
+    """Validation errors against training time, a panel a map."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    with open(path, newline="") as f:
+        rows = list(csv.DictReader(f))
+    if not rows:
+        return
+    hours = [float(r["seconds"]) / 3600 for r in rows]
+    names = [k.removesuffix("_average") for k in rows[0] if k.endswith("_average")]
+    figure, axes = plt.subplots(1, 5, figsize=(18, 3.5))
+    for ax, key in zip(axes, (*MAPS, "average"), strict=True):
+        for name in names:
+            ax.plot(hours, [float(r[f"{name}_{key}"]) for r in rows], ".-", label=name)
+        if key in SPREAD:
+            ax.axhline(SPREAD[key], color="0.7", lw=0.8)
+        ax.set(title=key, xlabel="hours of training", ylabel="RMSE", yscale="log")
+    if names:
+        axes[0].legend()
+    figure.tight_layout()
+    figure.savefig(out, dpi=80)
+    plt.close(figure)
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    p = argparse.ArgumentParser(prog="python -m nets.train", description=__doc__)
+    p.add_argument("--data", type=Path, required=True, help="folder of shards")
+    p.add_argument("--out", type=Path, required=True)
+    p.add_argument("--valid", nargs="*", default=[], metavar="NAME=DIR")
+    p.add_argument("--preset", default="small", choices=tuple(PRESETS))
+    p.add_argument("--clues", choices=CLUES)
+    p.add_argument("--active", choices=("on", "off"))
+    p.add_argument("--denoiser", choices=("on", "off"))
+    p.add_argument("--weights", type=Path, help="start from these")
+    p.add_argument("--steps", type=int, default=50000)
+    p.add_argument("--batch", type=int, default=8)
+    p.add_argument("--crop", type=int, default=96)
+    p.add_argument("--rate", type=float, default=1e-3)
+    p.add_argument("--last-rate", type=float, default=1e-7)
+    p.add_argument("--decay", type=float, default=1e-3, help="weight decay")
+    p.add_argument("--every", type=int, default=500, help="steps between validations")
+    p.add_argument("--seed", type=int, default=0)
+    p.add_argument("--threads", type=int, default=0)
+    p.add_argument("--device", default="cpu")
+    return p
+
+
+if __name__ == "__main__":
+    train(parser().parse_args())

@@ -1,0 +1,245 @@
+import csv
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from safetensors.numpy import load_file  # noqa: E402
+
+from invrender.errors import InputError  # noqa: E402
+from invrender.images import write_exr  # noqa: E402
+from invrender.maps import constant_maps, write_maps  # noqa: E402
+from nets import data, train  # noqa: E402
+from nets.loader import batches, positions, read_batch, shards  # noqa: E402
+from nets.loss import MAPS, compare, total_loss, truth  # noqa: E402
+from nets.model import build, load_weights  # noqa: E402
+
+OPTIONS = data.Options(size=16, samples=8, seed=3)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    out = tmp_path_factory.mktemp("shards")
+    for i in range(2):
+        data.write_shard(out, i, OPTIONS, 6)
+    return out
+
+
+# --- shards ---------------------------------------------------------------------------------------
+
+
+def test_a_shard_holds_captures_in_units_of_white(folder):
+    shard = load_file(shards(folder)[0])
+    assert shard["photo"].shape == (6, 3, 16, 16) and shard["maps"].shape == (6, 9, 16, 16)
+    assert shard["maps"].dtype == np.uint8 and shard["photo"].dtype == np.float16
+    white = shard["env_clues"][:, 9:].astype(float) + shard["active_clues"][:, 9:]
+    np.testing.assert_allclose(white.mean((1, 2, 3)), 0.6, rtol=0.01)
+    assert all(np.isfinite(v.astype(float)).all() for v in shard.values())
+    assert 0.01 < shard["photo"].astype(float).mean() < 1
+
+
+def test_shards_are_reproducible_and_differ(folder, tmp_path):
+    again = load_file(data.write_shard(tmp_path, 1, OPTIONS, 6))
+    first, second = (load_file(p) for p in shards(folder))
+    for k, v in second.items():
+        np.testing.assert_array_equal(again[k], v)
+    assert np.any(first["maps"] != second["maps"])
+    other = load_file(data.write_shard(tmp_path, 2, replace(OPTIONS, seed=4), 2))
+    assert np.any(other["maps"][:2] != first["maps"][:2])
+
+
+def test_what_is_there_is_not_made_again(folder):
+    path = shards(folder)[0]
+    before = path.stat().st_mtime_ns
+    assert data.write_shard(folder, 0, OPTIONS, 6) == path
+    assert path.stat().st_mtime_ns == before
+    assert not list(folder.glob("*.part")) and not list(folder.glob(".*.part"))
+
+
+def test_photo_is_the_ideal_one_but_for_display_and_sensor(folder):
+    """Same scene: they correlate, and agree in level within the screen's errors."""
+    shard = load_file(shards(folder)[0])
+    for photo, ideal in zip(shard["photo"].astype(float), shard["ideal"].astype(float), strict=True):
+        top = photo.max()
+        ratio = np.minimum(ideal, top).mean() / photo.mean()
+        assert 0.7 < ratio < 1.4
+
+
+def test_held_out_names_are_kept_apart(tmp_path):
+    for name in ("acg_Wood048", "mine", "acg_Bricks056"):
+        maps = constant_maps(8, 8, diffuse=0.3)
+        maps.diffuse[:4] = 0.5
+        (tmp_path / name).mkdir()
+        write_maps(tmp_path / name, maps)
+    (tmp_path / "broken").mkdir()
+    for n in ("basecolor", "normal", "roughness"):
+        (tmp_path / "broken" / f"{n}.png").write_bytes(b"no image")
+    assert len(data._folder_materials(str(tmp_path), "train")) == 1
+    assert len(data._folder_materials(str(tmp_path), "holdout")) == 2
+    (tmp_path / "rooms").mkdir()
+    for n in ("venice_sunset", "other"):
+        write_exr(tmp_path / "rooms" / f"{n}.exr", np.ones((8, 16, 3), np.float32))
+    rooms = str(tmp_path / "rooms")
+    assert len(data._folder_environments(rooms, "train", 8)) == 1
+    assert len(data._folder_environments(rooms, "holdout", 8)) == 1
+    assert len(data.holdout_names()) == 24
+
+
+def test_display_and_sensor_noise_are_small_and_seeded():
+    rng = np.random.default_rng(0)
+    pattern = data.placeholder_pattern(32)
+    assert pattern.min() >= 0 and pattern.max() <= 1
+    shown = data.display(rng, pattern)
+    assert shown.min() >= 0 and np.corrcoef(shown.ravel(), pattern.ravel())[0, 1] > 0.95
+    gain = data.fit_gain(pattern * np.array([1, 2, 3]), pattern, rng)
+    np.testing.assert_allclose(gain, [1, 2, 3], rtol=0.05)
+    image = np.full((32, 32, 3), 0.4)
+    a, b = (data.sensor(np.random.default_rng(5), image) for _ in range(2))
+    np.testing.assert_array_equal(a, b)
+    assert abs(a.mean() / 0.4 - 1) < 0.25 and a.std() < 0.1
+    assert data.capture_pattern(rng, shown).shape == (64, 64, 3)
+
+
+# --- loading --------------------------------------------------------------------------------------
+
+
+def test_batches_repeat_by_seed_and_go_on_from_a_step(folder):
+    take = lambda stream, n: [next(stream) for _ in range(n)]  # noqa: E731
+    a = take(batches(folder, 4, 8, 0), 7)
+    b = take(batches(folder, 4, 8, 0), 7)
+    later = take(batches(folder, 4, 8, 0, start=5), 2)
+    for x, y in [*zip(a, b, strict=True), *zip(a[5:], later, strict=True)]:
+        assert all(torch.equal(x[k], y[k]) for k in x)
+    other = next(batches(folder, 4, 8, 1))
+    assert not torch.equal(other["photo"], a[0]["photo"])
+    assert a[0]["photo"].shape == (4, 3, 8, 8) and a[0]["position"].shape == (4, 2, 8, 8)
+
+
+def test_processes_share_a_batch(folder):
+    whole = next(batches(folder, 4, 8, 0))
+    parts = [next(batches(folder, 2, 8, 0, rank=r, world=2)) for r in range(2)]
+    assert torch.equal(torch.cat([p["photo"] for p in parts]), whole["photo"])
+
+
+def test_a_crop_knows_where_it_lies(folder):
+    whole = torch.cat([b["photo"] for p in shards(folder) for b in read_batch(p, 6)])
+    crop = next(batches(folder, 4, 8, 0))
+    grid = positions(16, 16)
+    for photo, position in zip(crop["photo"], crop["position"], strict=True):
+        column = int((grid[0, 0] - position[0, 0, 0]).abs().argmin())
+        row = int((grid[1, :, 0] - position[1, 0, 0]).abs().argmin())
+        cut = whole[:, :, row : row + 8, column : column + 8]
+        assert (cut == photo).all(3).all(2).all(1).any()
+
+
+def test_no_shards(tmp_path):
+    with pytest.raises(InputError, match="no shards"):
+        next(batches(tmp_path, 4, 8, 0))
+
+
+# --- training -------------------------------------------------------------------------------------
+
+
+def options(folder, out, *more):
+    words = ["--data", folder, "--out", out, "--valid", f"val={folder}", "--preset", "tiny"]
+    words += ["--batch", 4, "--crop", 16, "--every", 5, *more]
+    return train.parser().parse_args([str(w) for w in words])
+
+
+def test_loss_is_least_at_the_truth(folder):
+    batch = next(read_batch(shards(folder)[0], 6))
+    t = truth(batch)
+    out = {k: v.clone() for k, v in t.items()} | {"sigma": torch.full((6, 4, 16, 16), 0.01)}
+    out["normal"] = out["normal"] * 2 - 1
+    out["normal0"] = out["normal"]
+    config = build("tiny").config
+    _, best = total_loss(out, batch, config)
+    assert all(best[k] == pytest.approx(0, abs=1e-5) for k in (*MAPS, "normal0"))
+    assert all(float(s.max()) < 1e-9 for s, _ in compare(out, batch).values())
+    out["roughness"] = out["roughness"] + 0.24
+    _, worse = total_loss(out, batch, config)
+    assert worse["roughness"] == pytest.approx(1, rel=0.01)
+    assert worse["sigma"] > best["sigma"]
+
+
+def test_network_overfits_a_batch(folder):
+    torch.manual_seed(0)
+    network = build("tiny").train()
+    batch = next(batches(folder, 4, 16, 0))
+    optimiser = torch.optim.AdamW(network.parameters(), 3e-3, betas=(0.9, 0.9))
+    losses = []
+    for _ in range(120):
+        optimiser.zero_grad()
+        loss, parts = total_loss(network(batch), batch, network.config)
+        loss.backward()
+        optimiser.step()
+        losses.append(sum(parts[k] for k in MAPS))
+    assert losses[-1] < 0.5 * losses[0]
+
+
+def test_training_resumes_to_the_same_weights(folder, tmp_path):
+    torch.set_num_threads(1)
+    whole = train.train(options(folder, tmp_path / "a", "--steps", 10))
+    first = options(folder, tmp_path / "b", "--steps", 10)
+    trainer = train.train(options(folder, tmp_path / "c", "--steps", 10))
+    # Stop after five steps, start again.
+    stop = train.Trainer.update
+
+    def until_five(self, batch, rate):
+        if self.step == 5:
+            raise KeyboardInterrupt
+        return stop(self, batch, rate)
+
+    train.Trainer.update = until_five
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            train.train(first)
+    finally:
+        train.Trainer.update = stop
+    resumed = train.train(first)
+    for k, v in whole.mean.items():
+        torch.testing.assert_close(trainer.mean[k], v, rtol=0, atol=0)
+        torch.testing.assert_close(resumed.mean[k], v, rtol=1e-5, atol=1e-6)
+    with open(tmp_path / "b" / "log.csv", newline="") as f:
+        rows = list(csv.DictReader(f))
+    assert [r["step"] for r in rows] == ["5", "10"] and float(rows[-1]["val_average"]) > 0
+    assert (tmp_path / "b" / "curve.png").stat().st_size > 1000
+    network, notes = load_weights(tmp_path / "b" / "weights.safetensors")
+    assert notes["step"] == 10 and not network.training
+    assert json.loads((tmp_path / "b" / "options.json").read_text())["steps"] == 10
+
+
+def test_steps_that_are_not_finite_are_skipped(folder, tmp_path):
+    trainer = train.Trainer(build("tiny"), tmp_path, torch.device("cpu"), 1e-3)
+    batch = next(batches(folder, 4, 16, 0))
+    before = {k: v.clone() for k, v in trainer.network.state_dict().items()}
+    with torch.no_grad():
+        trainer.network.encoder.intro.bias[0] = float("nan")
+    trainer.update(batch, 1e-3)
+    assert trainer.skipped == 1 and trainer.step == 1
+    for k, v in trainer.network.state_dict().items():
+        if k != "encoder.intro.bias":
+            assert torch.equal(v, before[k])
+
+
+def test_schedule():
+    rates = [train.learning_rate(s, 1000, 1e-3) for s in (0, 199, 200, 600, 1000)]
+    assert rates[0] == pytest.approx(5e-6) and rates[1] == rates[2] == pytest.approx(1e-3)
+    assert rates[3] == pytest.approx(5e-4, rel=0.01) and rates[4] == pytest.approx(1e-7)
+
+
+def test_calibration_and_baseline(folder):
+    network = build("tiny")
+    result = train.validate(network, folder, torch.device("cpu"))
+    scaled = torch.tensor([result[f"scale_{k}"] for k in MAPS])
+    network.calibration.copy_(scaled)
+    again = train.validate(network, folder, torch.device("cpu"))
+    for k in MAPS:
+        assert again[k] == pytest.approx(result[k])
+        if 0.01 < float(scaled[MAPS.index(k)]) < 3:  # sigma is limited
+            assert again[f"coverage_{k}"] == pytest.approx(0.68, abs=0.03)
+    guess = train.baseline(folder)
+    assert 0.02 < guess["normal"] < 0.3 and 0.02 < guess["diffuse"] < 0.4
