@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
+from scipy.ndimage import uniform_filter
 
 from invrender.initial import USUAL_ROUGHNESS, USUAL_SPECULAR, diffuse_rest, plane_terms
 from invrender.maps import Maps
@@ -30,20 +31,26 @@ LEAST_F0 = 0.02  # of common materials
 METAL = 0.2  # f0 from which a material may be bare metal
 FIT_SIZE = 128  # pixels a side of the fit: what decides is as wide as the pattern's features
 MEASUREMENTS = 100.0  # that a photo's worth of pixels counts for: texture repeats
-MATERIALS, ROUNDS = 4, 2
+MATERIALS, ROUNDS = 4, 4
 
 
 @dataclass(frozen=True)
 class Lobe:
-    """Roughness (an index into `ROUGHNESS`), f0 (3,), and whether light is scattered besides."""
+    """Index into `ROUGHNESS`, f0 (3,) and mean diffuse albedo (3,), which is nought for metal."""
 
     rho: int
     f0: Array
-    scatters: bool = True
+    albedo: Array
 
     def diffuse(self, photo: Array, terms: Any) -> Array:
         """What the lobe leaves of the photo, as diffuse albedo."""
-        return diffuse_rest(photo, terms, self.f0) * np.float32(self.scatters)
+        return diffuse_rest(photo, terms, self.f0) * np.float32(self.albedo.any())
+
+    def misfit(self, photo: Array, terms: Any, weight: Array) -> Array:
+        """Squared residual (H, W) of the photo if all of it were this material."""
+        e, b, a = terms
+        rest = photo - self.albedo * e / np.pi - self.f0 * b - a
+        return ((weight * rest) ** 2).sum(-1)
 
 
 def fit_lobes(photo: Array, prepared: Tables | Unbiased, samples: int = 64) -> Maps:
@@ -54,12 +61,19 @@ def fit_lobes(photo: Array, prepared: Tables | Unbiased, samples: int = 64) -> M
     small = photo[np.ix_(rows, columns)]
     terms = [plane_terms(prepared, h, w, float(rho), samples) for rho in ROUGHNESS]
 
-    usual = Lobe(int(np.abs(ROUGHNESS - USUAL_ROUGHNESS).argmin()), np.full(3, USUAL_SPECULAR))
+    weight = _weight(small, small)
+    rho = int(np.abs(ROUGHNESS - USUAL_ROUGHNESS).argmin())
+    usual = Lobe(rho, np.full(3, USUAL_SPECULAR), np.ones(3))
     whole = _fit(small, terms, np.ones((h, w), bool), usual)
-    label, lobes = np.zeros((h, w), np.intp), [whole]
+    # Groups of like albedo first; then each pixel joins the material that explains it best, with
+    # its neighbours.
+    label = _group(whole.diffuse(small, terms[whole.rho]))
+    lobes = [whole]
     for _ in range(ROUNDS):
-        label = _group(_select(label, [f.diffuse(small, terms[f.rho]) for f in lobes]))
         lobes = [_fit(small, terms, label == k, whole) for k in range(int(label.max()) + 1)]
+        misfit = [uniform_filter(f.misfit(small, terms[f.rho], weight), 3) for f in lobes]
+        label = np.unique(np.argmin(misfit, 0), return_inverse=True)[1].reshape(h, w)
+    lobes = [_fit(small, terms, label == k, whole) for k in range(int(label.max()) + 1)]
 
     # To full size: each pixel takes the lobe of the fitted pixel that it lies in.
     label = label[np.ix_(_centres(height, h), _centres(width, w))]
@@ -103,31 +117,38 @@ def _fit(photo: Array, terms: list[Any], of: NDArray[np.bool_], usual: Lobe) -> 
     """The lobe of the pixels ``of``: as usual, of another f0, or bare metal."""
     measurements = MEASUREMENTS * float(of.mean())
     pixels = photo[of].astype(np.float64)
-    level = photo.mean((0, 1)) + 1e-12
-    weight = 1 / np.sqrt(level * (pixels + 0.1 * level))
+    weight = _weight(photo, pixels)
     n = len(ROUGHNESS)
-    residual, f0 = np.zeros((3, n)), np.zeros((3, n, 3))
+    residual, f0, albedo = np.zeros((3, n)), np.zeros((3, n, 3)), np.zeros((3, n, 3))
     for i, (e, b, a) in enumerate(terms):
         for c in range(3):
             w = weight[:, c]
             x, y, z = w * e[of][:, c] / np.pi, w * b[of][:, c], w * (pixels[:, c] - a[of][:, c])
-            variance = _least_squares(x, y, z, 0.0, 0.0)[1]
+            variance = _least_squares(x, y, z, 0.0, 0.0)[2]
             pulls = [variance / measurements / s**2 for s in SPREAD_F0]
             fits = [_least_squares(x, y, z, pull, float(usual.f0[c])) for pull in pulls]
             fits.append(_least_squares(0 * x, y, z, 0.0, 0.0))
             for k in range(3):
-                f0[k, i, c] = fits[k][0]
-                residual[k, i] += fits[k][1] / 3
+                f0[k, i, c], albedo[k, i, c] = fits[k][:2]
+                residual[k, i] += fits[k][2] / 3
     cost = measurements * np.log(residual + 1e-9)
     cost += ((ROUGHNESS - ROUGHNESS[usual.rho]) / SPREAD) ** 2
     cost[1:] += UNUSUAL
     cost[2, f0[2].mean(-1) < METAL] = np.inf
     k, rho = np.unravel_index(np.argmin(cost), cost.shape)
-    return Lobe(int(rho), f0[k, rho], scatters=bool(k != 2))
+    return Lobe(int(rho), f0[k, rho], albedo[k, rho] if k < 2 else np.zeros(3))
 
 
-def _least_squares(x: Array, y: Array, z: Array, pull: float, usual: float) -> tuple[float, float]:
-    """k_s of z ≈ k_d·x + k_s·y with k_d in [0, 1], k_s from `LEAST_F0`; mean squared residual.
+def _weight(photo: Array, pixels: Array) -> Array:
+    """Inverse standard deviation of pixels relative to the photo's mean: shot noise and floor."""
+    level = photo.mean((0, 1)) + 1e-12
+    return 1 / np.sqrt(level * (pixels + 0.1 * level))
+
+
+def _least_squares(
+    x: Array, y: Array, z: Array, pull: float, usual: float
+) -> tuple[float, float, float]:
+    """k_s from `LEAST_F0` and k_d in [0, 1] of z ≈ k_d·x + k_s·y, and the mean squared residual.
 
     pull: weight of (k_s - usual)².
     """
@@ -135,5 +156,5 @@ def _least_squares(x: Array, y: Array, z: Array, pull: float, usual: float) -> t
     yy, yz = (y * y).mean() + pull + 1e-20, (y * z).mean() + pull * usual
     k_d = np.clip((yy * xz - xy * yz) / max(xx * yy - xy * xy, 1e-30), 0, 1)
     k_s = float(np.clip((yz - xy * k_d) / yy, LEAST_F0, 1))
-    k_d = np.clip((xz - xy * k_s) / xx, 0, 1)
-    return k_s, float(((z - k_d * x - k_s * y) ** 2).mean())
+    k_d = float(np.clip((xz - xy * k_s) / xx, 0, 1))
+    return k_s, k_d, float(((z - k_d * x - k_s * y) ** 2).mean())

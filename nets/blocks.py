@@ -21,19 +21,18 @@ class Pointwise(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, bias: bool = True) -> None:
         super().__init__()
-        self.weight = nn.Parameter(torch.empty(outputs, inputs))
-        self.bias = nn.Parameter(torch.empty(outputs)) if bias else None
         bound = inputs**-0.5
-        nn.init.uniform_(self.weight, -bound, bound)
-        if self.bias is not None:
-            nn.init.uniform_(self.bias, -bound, bound)
+        self.weight = nn.Parameter(torch.empty(outputs, inputs).uniform_(-bound, bound))
+        self.bias = nn.Parameter(torch.empty(outputs).uniform_(-bound, bound)) if bias else None
 
     def forward(self, x: Tensor, scale: Tensor | None = None) -> Tensor:
-        weight, bias = self.weight, self.bias
-        if scale is not None:
-            weight = weight * scale[:, None]
-            bias = None if bias is None else bias * scale
-        return F.linear(x.permute(0, 2, 3, 1), weight, bias).permute(0, 3, 1, 2)
+        x = x.permute(0, 2, 3, 1)
+        if scale is None:
+            y = F.linear(x, self.weight, self.bias)
+        else:
+            bias = None if self.bias is None else self.bias * scale
+            y = F.linear(x, self.weight * scale[:, None], bias)
+        return y.permute(0, 3, 1, 2)
 
 
 class LayerNorm2d(nn.Module):
@@ -119,8 +118,7 @@ class Decoder(nn.Module):
         super().__init__()
         channels = [width << k for k in reversed(range(len(counts)))]
         self.up = nn.ModuleList(
-            nn.Sequential(Pointwise(2 * c, 4 * c, bias=False), nn.PixelShuffle(2))
-            for c in channels
+            nn.Sequential(Pointwise(2 * c, 4 * c, bias=False), nn.PixelShuffle(2)) for c in channels
         )
         self.levels = nn.ModuleList(blocks(c, n) for c, n in zip(channels, counts, strict=True))
         self.ending = nn.Conv2d(width, outputs, 3, padding=1)

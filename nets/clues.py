@@ -136,4 +136,3 @@ def white_level(lights: dict[str, Array], environment: bool = True) -> float:
     if environment:
         level = level + lights["env_clues"][white].mean() / ALBEDO
     return float(level)
-

@@ -154,7 +154,9 @@ def draw_material(rng: np.random.Generator, options: Options) -> Maps:
     for _ in range(20):
         maps = one()
         if options.split == "train" and rng.random() < 0.1 and n >= 8:
-            field = gaussian_filter(rng.standard_normal((n, n)), n / rng.uniform(4, 16), mode="wrap")
+            field = gaussian_filter(
+                rng.standard_normal((n, n)), n / rng.uniform(4, 16), mode="wrap"
+            )
             edge = np.clip(0.5 + field / field.std() / rng.uniform(0.02, 0.5), 0, 1)
             maps = mix(maps, one(), edge.astype(np.float32), float(rng.uniform(-1, 1)))
         try:
@@ -298,7 +300,7 @@ def make_group(rng: np.random.Generator, options: Options) -> list[Sample]:
 
 
 def _material(maps: Maps) -> Material:
-    """As `material_from_maps`, but constant maps stay whole, lest they make kernels of their own."""
+    """As `material_from_maps`; constant maps stay whole, lest they make kernels of their own."""
     vec3 = vector(Float, 3)
     rows = lambda image: np.ascontiguousarray(image.reshape(-1, 3).T, np.float32)  # noqa: E731
     return Material(

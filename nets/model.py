@@ -137,9 +137,10 @@ class Network(nn.Module):
         with torch.no_grad():
             self.material_decoder.ending.weight *= 0.1
             self.normal_decoder.ending.weight *= 0.1
-            self.normal_decoder.ending.bias.zero_()
             start = [0, 0, *[0.3] * 3, 0.5, *[0.1] * 3, -3, -1.5, -1.5, -2]
-            self.material_decoder.ending.bias.copy_(torch.tensor(start))
+            for decoder, values in ((self.normal_decoder, [0, 0]), (self.material_decoder, start)):
+                assert decoder.ending.bias is not None
+                decoder.ending.bias.copy_(torch.tensor(values))
         self.register_buffer("table", brdf_table(), persistent=False)
         self.register_buffer("calibration", torch.ones(4))
 
@@ -262,9 +263,7 @@ def build(name: str, **changes: Any) -> Network:
 
 def save_weights(path: Path, network: Network, notes: dict[str, Any], half: bool = False) -> None:
     """Write safetensors with the `Config` and ``notes`` as JSON in its header."""
-    tensors = {
-        k: (v.half() if half else v).contiguous() for k, v in network.state_dict().items()
-    }
+    tensors = {k: (v.half() if half else v).contiguous() for k, v in network.state_dict().items()}
     metadata = {"config": json.dumps(asdict(network.config)), "notes": json.dumps(notes)}
     part = path.with_suffix(".part")
     save_file(tensors, part, metadata=metadata)
@@ -277,7 +276,8 @@ def load_weights(path: Path) -> tuple[Network, dict[str, Any]]:
         with safe_open(path, "pt") as f:
             metadata = f.metadata() or {}
         fields = json.loads(metadata["config"])
-        config = Config(**{k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()})
+        changes: dict[str, Any] = {k: tuple(v) if type(v) is list else v for k, v in fields.items()}
+        config = Config(**changes)
         network = Network(config)
         network.load_state_dict({k: v.float() for k, v in load_file(path).items()})
     except (OSError, KeyError, TypeError, ValueError, RuntimeError) as e:

@@ -72,7 +72,7 @@ def _lobe(cos: Array, roughness: float | None, texel: float = 0.0) -> Array:
 
 
 @cache
-def _sky_kernel(roughness: float | None) -> tuple[Array, Array]:
+def _sky_kernel(roughness: float | None) -> NDArray[np.complex128]:
     """Fourier coefficients along φ of the lobe between rows: (frequency, row out, row in)."""
     rows, columns = SKY_ROWS, 2 * SKY_ROWS
     theta = (np.arange(rows) + 0.5) * np.pi / rows
@@ -81,7 +81,7 @@ def _sky_kernel(roughness: float | None) -> tuple[Array, Array]:
     cos = c[:, None, None] * c[None, :, None] + s[:, None, None] * s[None, :, None] * np.cos(phi)
     lobe = _lobe(cos, roughness, np.pi / rows) * solid_angles(rows, columns)[None, :, None]
     lobe /= lobe.sum((1, 2), keepdims=True)
-    return np.fft.rfft(lobe[:, : rows // 2], axis=2).transpose(2, 0, 1), theta
+    return np.fft.rfft(lobe[:, : rows // 2], axis=2).transpose(2, 0, 1)
 
 
 @cache
@@ -108,7 +108,7 @@ def prefilter_sky(
     rows, columns = _disc_lookup(size)
     out = np.empty((len(roughness), size, size, 3), np.float32)
     for k, rho in enumerate(roughness):
-        kernel, _ = _sky_kernel(rho)
+        kernel = _sky_kernel(rho)
         image = np.fft.irfft((kernel @ spectrum).transpose(1, 0, 2), n=2 * SKY_ROWS, axis=1)
         image = np.pad(image, ((1, 1), (1, 1), (0, 0)), mode="edge")
         image[:, 0], image[:, -1] = image[:, -2], image[:, 1]
@@ -215,7 +215,8 @@ def look_up_sky(sky: Tensor, direction: Tensor) -> Tensor:
 
 def sample(image: Tensor, position: Tensor, padding: str = "border") -> Tensor:
     """Bilinear look-up of (B, C, h, w) at (B, 2, H, W) in [-1, 1]², x right and y up."""
-    grid = torch.stack([position[:, 0], -position[:, 1]], -1)
+    # Torch's backward pass writes out of bounds where a coordinate is NaN.
+    grid = torch.nan_to_num(torch.stack([position[:, 0], -position[:, 1]], -1)).clamp(-1e3, 1e3)
     return F.grid_sample(image, grid, padding_mode=padding, align_corners=False)
 
 
@@ -247,7 +248,7 @@ def brdf_factors(n_v: Tensor, roughness: float, table: Tensor) -> tuple[Tensor, 
     row = min(max(roughness * size - 0.5, 0), size - 1)
     r0 = min(int(row), size - 2)
     line = torch.lerp(table[:, r0], table[:, r0 + 1], row - r0)
-    at = (n_v * size - 0.5).clamp(0, size - 1)
+    at = torch.nan_to_num(n_v * size - 0.5).clamp(0, size - 1)
     i = at.detach().floor().clamp(max=size - 2).long()
     f = at - i
     b, a = ((1 - f) * line[k][i] + f * line[k][i + 1] for k in (0, 1))
@@ -285,10 +286,8 @@ def normal_clues(
     active = None
     if screen is not None:
         seen = look_up_screen(screen, hit_screen(position, mirror, rig)).chunk(len(levels), 1)
-        active = torch.cat(
-            [s * (albedo * factors[r][0] + factors[r][1]) for s, r in zip(seen, levels, strict=True)],
-            1,
-        )
+        white = [albedo * factors[rho][0] + factors[rho][1] for rho in levels]
+        active = torch.cat([s * w for s, w in zip(seen, white, strict=True)], 1)
     return torch.cat(images, 1), active
 
 

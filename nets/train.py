@@ -67,9 +67,9 @@ class Trainer:
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
         self.step += 1
-        if not torch.isfinite(norm) or not torch.isfinite(loss):
+        if not (torch.isfinite(norm) and torch.isfinite(loss)):
             self.skipped += 1
-            return parts
+            return {}
         self.optimiser.step()
         decay = min(EMA_DECAY, (1 + self.step) / (10 + self.step))
         with torch.no_grad():
@@ -237,14 +237,14 @@ def run(
         batch = {k: v.to(trainer.device) for k, v in next(stream).items()}
         rate = learning_rate(trainer.step, args.steps, args.rate, args.last_rate)
         parts = trainer.update(batch, rate)
-        count += 1
+        count += bool(parts)
         for k, v in parts.items():
             sums[k] = sums.get(k, 0.0) + v
         if trainer.step % args.every and trainer.step < args.steps:
             continue
         trainer.seconds += time.perf_counter() - start
         if rank == 0:
-            means = {k: v / count for k, v in sums.items()}
+            means = {k: v / max(count, 1) for k, v in sums.items()}
             row = {"step": trainer.step, "seconds": trainer.seconds, "skipped": trainer.skipped}
             row |= {f"train_{k}": v for k, v in means.items()}
             scales = []
@@ -265,13 +265,16 @@ def run(
 
 
 def append_log(path: Path, row: dict[str, float]) -> None:
-    """Add a line to a CSV, with a header where the file is new."""
-    new = not path.exists()
+    """Add a line to a CSV; the first one's keys are the columns."""
+    names = list(row)
+    if path.exists():
+        with open(path, newline="") as f:
+            names = next(csv.reader(f))
     with open(path, "a", newline="") as f:
         writer = csv.writer(f)
-        if new:
-            writer.writerow(row)
-        writer.writerow([f"{v:.6g}" for v in row.values()])
+        if f.tell() == 0:
+            writer.writerow(names)
+        writer.writerow([f"{row[k]:.6g}" if k in row else "nan" for k in names])
 
 
 def plot_log(path: Path, out: Path) -> None:

@@ -18,6 +18,7 @@ from nets.loss import MAPS, compare, total_loss, truth  # noqa: E402
 from nets.model import build, load_weights  # noqa: E402
 
 OPTIONS = data.Options(size=16, samples=8, seed=3)
+torch.set_num_threads(1)  # small tensors: more only get in each other's way
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +63,9 @@ def test_what_is_there_is_not_made_again(folder):
 def test_photo_is_the_ideal_one_but_for_display_and_sensor(folder):
     """Same scene: they correlate, and agree in level within the screen's errors."""
     shard = load_file(shards(folder)[0])
-    for photo, ideal in zip(shard["photo"].astype(float), shard["ideal"].astype(float), strict=True):
+    for photo, ideal in zip(
+        shard["photo"].astype(float), shard["ideal"].astype(float), strict=True
+    ):
         top = photo.max()
         ratio = np.minimum(ideal, top).mean() / photo.mean()
         assert 0.7 < ratio < 1.4
@@ -181,7 +184,6 @@ def test_network_overfits_a_batch(folder):
 
 
 def test_training_resumes_to_the_same_weights(folder, tmp_path):
-    torch.set_num_threads(1)
     whole = train.train(options(folder, tmp_path / "a", "--steps", 10))
     first = options(folder, tmp_path / "b", "--steps", 10)
     trainer = train.train(options(folder, tmp_path / "c", "--steps", 10))

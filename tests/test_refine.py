@@ -1,0 +1,145 @@
+"""Initial maps, lobes and refinement on photos rendered from known maps."""
+
+import numpy as np
+import pytest
+
+from invrender.environments import procedural_environment, scale_environment
+from invrender.initial import flat_maps
+from invrender.lobes import fit_lobes
+from invrender.maps import constant_maps, map_errors
+from invrender.pattern import block_pattern
+from invrender.refine import (
+    MIN_ROUGHNESS,
+    Prior,
+    linearise,
+    lobe_prior,
+    refine,
+    to_maps,
+    to_theta,
+)
+from invrender.render import make_scene, prepare, render
+from invrender.rig import Rig
+
+RIG, PATTERN, GAIN = Rig(), block_pattern(64), 2.0
+SIZE = 32
+
+
+@pytest.fixture(scope="module")
+def environment():
+    return scale_environment(procedural_environment(3, 64), 0.3)
+
+
+@pytest.fixture(scope="module")
+def prepared(environment):
+    return prepare(make_scene(RIG, PATTERN, environment, GAIN))
+
+
+def photo_of(maps, environment, samples=64):
+    return render(RIG, maps, PATTERN, environment, GAIN, samples=samples)
+
+
+def test_theta_round_trip():
+    rng = np.random.default_rng(0)
+    maps = constant_maps(8, 8)
+    maps.diffuse[:] = rng.random((8, 8, 3))
+    slopes = rng.normal(0, 0.3, (8, 8, 2))
+    maps.normal[..., :2] = slopes
+    maps.normal /= np.linalg.norm(maps.normal, axis=-1, keepdims=True)
+    back = to_maps(to_theta(maps))
+    assert max(map_errors(back, maps).values()) < 1e-6
+
+
+def test_linearise_predicts_small_changes(prepared):
+    rng = np.random.default_rng(1)
+    theta = to_theta(constant_maps(SIZE, SIZE, 0.4, 0.1, 0.5))
+    theta += 0.05 * rng.standard_normal(theta.shape).astype(np.float32)
+    step = 2e-4 * rng.standard_normal(theta.shape).astype(np.float32)
+    image, jacobian = linearise(prepared, theta, 64)
+    moved, _ = linearise(prepared, theta + step, 64)
+    predicted = np.einsum("hwcp,hwp->hwc", jacobian, step)
+    error = np.linalg.norm(moved - image - predicted) / np.linalg.norm(predicted)
+    assert error < 0.02
+
+
+@pytest.mark.parametrize(
+    ("k_d", "k_s", "rho"),
+    [
+        ((0.4, 0.3, 0.2), 0.04, 0.55),
+        ((0.05, 0.06, 0.1), 0.04, 0.23),
+        ((0, 0, 0), (0.9, 0.7, 0.4), 0.32),
+    ],
+    ids=["matt", "glossy", "metal"],
+)
+def test_lobe_of_a_uniform_sample_is_found(prepared, environment, k_d, k_s, rho):
+    truth = constant_maps(SIZE, SIZE, k_d, k_s, rho)
+    maps = fit_lobes(photo_of(truth, environment), prepared)
+    error = map_errors(maps, truth)
+    assert error["roughness"] < 0.02
+    assert error["specular"] < 0.02
+    assert error["diffuse"] < 0.02
+
+
+def test_two_materials_get_two_lobes(prepared, environment):
+    truth = constant_maps(SIZE, SIZE, (0.5, 0.3, 0.1), 0.04, 0.7)
+    half = SIZE // 2
+    truth.diffuse[:, :half], truth.specular[:, :half] = 0, 0.8
+    truth.roughness[:, :half] = 0.32
+    photo = photo_of(truth, environment)
+    start, maps = flat_maps(photo, prepared), fit_lobes(photo, prepared)
+    assert map_errors(maps, truth)["average"] < 0.4 * map_errors(start, truth)["average"]
+
+
+def test_photo_of_the_prior_changes_nothing(prepared, environment):
+    maps = constant_maps(SIZE, SIZE, 0.3, 0.04, 0.5)
+    result = refine(photo_of(maps, environment), prepared, lobe_prior(maps))
+    assert result.converged
+    assert max(map_errors(result.maps, maps).values()) < 1e-3
+
+
+def test_normals_are_recovered_where_all_else_is_known(prepared, environment):
+    truth = constant_maps(SIZE, SIZE, 0.3, 0.3, 0.4)
+    y, x = np.mgrid[:SIZE, :SIZE] / SIZE * 2 * np.pi
+    # Slight relief: a reflection must not jump from one block of the pattern to the next.
+    truth.normal[..., 0], truth.normal[..., 1] = 0.05 * np.sin(2 * x), 0.05 * np.cos(3 * y)
+    truth.normal /= np.linalg.norm(truth.normal, axis=-1, keepdims=True)
+    photo = photo_of(truth, environment)
+    start = constant_maps(SIZE, SIZE, 0.3, 0.3, 0.4)
+    sigma = np.full((SIZE, SIZE, 9), 1e-3, np.float32)
+    sigma[..., 7:] = 0.3
+    result = refine(photo, prepared, Prior(to_theta(start), sigma, np.eye(9, dtype=np.float32)))
+    before, after = map_errors(start, truth), map_errors(result.maps, truth)
+    assert after["normal"] < 0.7 * before["normal"]
+    errors = [h["photo_error"] for h in result.history]
+    assert errors[-1] < 0.3 * errors[0]
+    # The photo tells slopes, but the assumed noise leaves some doubt: about as much as there is.
+    left = result.sigma[..., 7:]
+    assert np.median(left) < 0.1
+    error = (to_theta(result.maps) - to_theta(truth))[..., 7:]
+    assert 0.2 < np.sqrt(np.mean((error / left) ** 2)) < 1.5
+
+
+def test_clipped_pixels_keep_their_prior(prepared, environment):
+    truth = constant_maps(SIZE, SIZE, 0.5, 0.04, 0.5)
+    prior = lobe_prior(constant_maps(SIZE, SIZE, 0.2, 0.04, 0.5))
+    clipped = np.zeros((SIZE, SIZE), bool)
+    clipped[:8] = True
+    result = refine(photo_of(truth, environment), prepared, prior, clipped=clipped)
+    np.testing.assert_allclose(result.maps.diffuse[:8], 0.2, atol=1e-3)
+    assert result.maps.diffuse[8:].mean() > 0.25
+
+
+@pytest.mark.parametrize("value", [0.0, 1e-6, 1e4])
+def test_any_photo_gives_finite_maps_in_range(prepared, value):
+    photo = np.full((8, 8, 3), value, np.float32)
+    maps = fit_lobes(photo, prepared)
+    result = refine(photo, prepared, lobe_prior(maps), iterations=3)
+    for image in result.maps.encoded().values():
+        assert np.isfinite(image).all() and image.min() >= 0 and image.max() <= 1
+    assert result.maps.roughness.min() >= MIN_ROUGHNESS
+    assert np.isfinite(result.sigma).all()
+
+
+def test_one_pixel(prepared):
+    photo = np.full((1, 1, 3), 0.1, np.float32)
+    result = refine(photo, prepared, lobe_prior(fit_lobes(photo, prepared)))
+    assert result.maps.shape == (1, 1)
