@@ -135,8 +135,8 @@ def _fit(photo: Array, terms: list[Any], of: NDArray[np.bool_], usual: Lobe) -> 
     cost += ((ROUGHNESS - ROUGHNESS[usual.rho]) / SPREAD) ** 2
     cost[1:] += UNUSUAL
     cost[2, f0[2].mean(-1) < METAL] = np.inf
-    k, rho = np.unravel_index(np.argmin(cost), cost.shape)
-    return Lobe(int(rho), f0[k, rho], albedo[k, rho] if k < 2 else np.zeros(3))
+    k, rho = (int(i) for i in np.unravel_index(np.argmin(cost), cost.shape))
+    return Lobe(rho, f0[k, rho], albedo[k, rho] if k < 2 else np.zeros(3))
 
 
 def _weight(photo: Array, pixels: Array) -> Array:

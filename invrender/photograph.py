@@ -19,6 +19,7 @@ from invrender.rig import Rig
 import mitsuba as mi  # isort: skip  (after the back end has chosen its LLVM)
 
 mi.set_variant(f"{BACKEND}_ad_rgb")
+mi.set_log_level(mi.LogLevel.Error)  # it warns of sample counts that it rounds
 
 Image = NDArray[np.floating[Any]]
 SAMPLE_LIFT = 1e-4  # of the screen's size: the table lies that far below the sample

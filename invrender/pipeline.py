@@ -150,7 +150,7 @@ def crop_mask(photo: Photo, rig: Rig, size: int) -> NDArray[np.bool_]:
         return np.zeros((size, size), bool)
     mask = np.repeat(photo.clipped[..., None].astype(np.float32), 3, -1)
     wide = ndimage.maximum_filter(mask, (3, 3, 1))
-    return crop_sample(Photo(wide), rig, size, order=1)[..., 0] > 1e-3
+    return crop_sample(Photo(wide), rig, size)[..., 0] > 0.05
 
 
 def _photo_error(picture: Array, photo: Array, clipped: NDArray[np.bool_]) -> float:

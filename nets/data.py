@@ -46,6 +46,7 @@ from invrender.materials import (
     procedural_material,
     read_material,
 )
+from invrender.pattern import default_pattern
 from invrender.render import Material, prepare, radiance
 from invrender.rig import Rig
 from invrender.scene import make_scene, make_view
@@ -89,19 +90,7 @@ def light_pattern(path: str = "", size: int = 128) -> Array:
     """The pattern (size, size, 3) from a file, or the default one."""
     if path:
         return area_resize(np.clip(read_image(Path(path)), 0, 1), size)
-    try:
-        from invrender.pattern import default_pattern  # type: ignore[import-not-found]
-    except ImportError:
-        return placeholder_pattern(size)
-    return np.asarray(default_pattern(size), np.float32)
-
-
-def placeholder_pattern(size: int) -> Array:
-    """Soft blocks of saturated colours, until there is a default pattern."""
-    rng = np.random.default_rng(7)
-    blocks = rng.permutation(np.array([*np.eye(3), *(1 - np.eye(3))] * 3)[:16]).reshape(4, 4, 3)
-    big = np.kron(blocks, np.ones((32, 32, 1)))
-    return area_resize(gaussian_filter(big, (3, 3, 0)).astype(np.float32), size)
+    return default_pattern(size)
 
 
 def holdout_names() -> set[str]:

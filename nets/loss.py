@@ -11,7 +11,7 @@ from nets.model import MAPS, Batch, Config, encode, normalise
 
 # Spread of each map over the training data: the error of a constant guess. Errors are measured in
 # it, so that normals (small) and roughness (smooth) weigh as much as albedos from the start.
-SPREAD = {"normal": 0.10, "diffuse": 0.22, "roughness": 0.24, "specular": 0.18}
+SPREAD = {"normal": 0.065, "diffuse": 0.19, "roughness": 0.26, "specular": 0.17}
 NORMAL0_WEIGHT = 0.5
 DENOISED_WEIGHT = 0.5
 SIGMA_WEIGHT = 0.1

@@ -12,9 +12,10 @@ from safetensors.numpy import load_file  # noqa: E402
 from invrender.errors import InputError  # noqa: E402
 from invrender.images import write_exr  # noqa: E402
 from invrender.maps import constant_maps, write_maps  # noqa: E402
+from invrender.pattern import block_pattern  # noqa: E402
 from nets import data, train  # noqa: E402
 from nets.loader import batches, positions, read_batch, shards  # noqa: E402
-from nets.loss import MAPS, compare, total_loss, truth  # noqa: E402
+from nets.loss import MAPS, SPREAD, compare, total_loss, truth  # noqa: E402
 from nets.model import build, load_weights  # noqa: E402
 
 OPTIONS = data.Options(size=16, samples=8, seed=3)
@@ -93,7 +94,7 @@ def test_held_out_names_are_kept_apart(tmp_path):
 
 def test_display_and_sensor_noise_are_small_and_seeded():
     rng = np.random.default_rng(0)
-    pattern = data.placeholder_pattern(32)
+    pattern = block_pattern(32)
     assert pattern.min() >= 0 and pattern.max() <= 1
     shown = data.display(rng, pattern)
     assert shown.min() >= 0 and np.corrcoef(shown.ravel(), pattern.ravel())[0, 1] > 0.95
@@ -162,7 +163,7 @@ def test_loss_is_least_at_the_truth(folder):
     _, best = total_loss(out, batch, config)
     assert all(best[k] == pytest.approx(0, abs=1e-5) for k in (*MAPS, "normal0"))
     assert all(float(s.max()) < 1e-9 for s, _ in compare(out, batch).values())
-    out["roughness"] = out["roughness"] + 0.24
+    out["roughness"] = out["roughness"] + SPREAD["roughness"]
     _, worse = total_loss(out, batch, config)
     assert worse["roughness"] == pytest.approx(1, rel=0.01)
     assert worse["sigma"] > best["sigma"]

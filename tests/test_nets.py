@@ -7,11 +7,11 @@ torch = pytest.importorskip("torch")
 
 from invrender.environments import procedural_environment, scale_environment  # noqa: E402
 from invrender.errors import InputError  # noqa: E402
+from invrender.pattern import block_pattern  # noqa: E402
 from invrender.rig import Rig  # noqa: E402
 from invrender.scene import make_scene  # noqa: E402
 from nets import clues, splitsum  # noqa: E402
 from nets.blocks import NAFBlock, pad_to  # noqa: E402
-from nets.data import placeholder_pattern  # noqa: E402
 from nets.infer import Reconstructor, _tiles  # noqa: E402
 from nets.loader import positions  # noqa: E402
 from nets.model import CLUES, build, load_weights, normalise, save_weights  # noqa: E402
@@ -23,7 +23,7 @@ torch.set_num_threads(1)  # small tensors: more only get in each other's way
 @pytest.fixture(scope="module")
 def lights():
     env = scale_environment(procedural_environment(5, 32), 0.5)
-    return clues.light_inputs(RIG, placeholder_pattern(64), [1.0, 0.9, 1.1], env, samples=16)
+    return clues.light_inputs(RIG, block_pattern(64), [1.0, 0.9, 1.1], env, samples=16)
 
 
 def make_batch(lights, height, width, count=1, seed=0):
@@ -145,7 +145,7 @@ def test_table_conserves_energy():
 def test_split_sum_resembles_the_exact_light():
     """On a plane without a screen, and of the screen alone."""
     env = scale_environment(procedural_environment(11, 64, kind="sky"), 0.5)
-    lit = clues.light_inputs(RIG, placeholder_pattern(64), 1.0, None)
+    lit = clues.light_inputs(RIG, block_pattern(64), 1.0, None)
     stack = splitsum.prefilter_sky(env, (*clues.ROUGHNESS, None))
     lit["sky"] = np.concatenate(list(stack), -1).transpose(2, 0, 1)
     exact = clues.plane_clues(make_scene(RIG, None, env), 12, 64).transpose(2, 0, 1)
@@ -296,7 +296,7 @@ def test_inference_at_any_size(reconstructor, shape):
     env = scale_environment(procedural_environment(5, 32), 0.5)
     steps = []
     result = reconstructor(
-        rng.random((*shape, 3)), RIG, placeholder_pattern(64), 1.0, env, progress=steps.append
+        rng.random((*shape, 3)), RIG, block_pattern(64), 1.0, env, progress=steps.append
     )
     assert result.maps.shape == shape and set(result.sigma) == set(result.maps.encoded())
     assert all(v.shape == shape and (v > 0).all() for v in result.sigma.values())
@@ -306,10 +306,10 @@ def test_inference_at_any_size(reconstructor, shape):
 
 
 def test_inference_without_a_room_or_with_a_bad_photo(reconstructor):
-    result = reconstructor(np.zeros((8, 8, 3)), RIG, placeholder_pattern(64), 1.0)
+    result = reconstructor(np.zeros((8, 8, 3)), RIG, block_pattern(64), 1.0)
     assert np.isfinite(result.maps.diffuse).all()
     with pytest.raises(InputError, match="photo"):
-        reconstructor(np.zeros((8, 8)), RIG, placeholder_pattern(64), 1.0)
+        reconstructor(np.zeros((8, 8)), RIG, block_pattern(64), 1.0)
 
 
 def test_tiles_cover_and_blend(reconstructor, lights, monkeypatch):

@@ -1,6 +1,6 @@
 """Procedural materials and environments beside real ones: sheets to look at, statistics, timings.
 
-    python benchmarks/statistics.py --materials DIR --envs DIR --out DIR [--quick]
+    python benchmarks/data_statistics.py --materials DIR --envs DIR --out DIR [--quick]
 
 Writes procedural.png, real.png, environments.png (each cell of the first two: lit from the front
 left; beside it albedo, specular, roughness, normal), histograms.png, statistics.md and
