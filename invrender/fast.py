@@ -98,7 +98,10 @@ def shade_fast(
             )
 
         sums.run(n_samples, specular, (1, 2), "specular", inv_n)
-    return sums.shading()
+    shading = sums.shading()
+    # The sky behind the screen is subtracted: where that is nearly all of it, rounding may show.
+    shading.irradiance = dr.maximum(shading.irradiance, 0)
+    return shading
 
 
 @dataclass

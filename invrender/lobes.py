@@ -61,26 +61,24 @@ def fit_lobes(photo: Array, prepared: Tables | Unbiased, samples: int = 64) -> M
     small = photo[np.ix_(rows, columns)]
     terms = [plane_terms(prepared, h, w, float(rho), samples) for rho in ROUGHNESS]
 
-    weight = _weight(small, small)
     rho = int(np.abs(ROUGHNESS - USUAL_ROUGHNESS).argmin())
     usual = Lobe(rho, np.full(3, USUAL_SPECULAR), np.ones(3))
     whole = _fit(small, terms, np.ones((h, w), bool), usual)
     # Groups of like albedo first; then each pixel joins the material that explains it best, with
     # its neighbours.
     label = _group(whole.diffuse(small, terms[whole.rho]))
-    lobes = [whole]
     for _ in range(ROUNDS):
         lobes = [_fit(small, terms, label == k, whole) for k in range(int(label.max()) + 1)]
-        misfit = [uniform_filter(f.misfit(small, terms[f.rho], weight), 3) for f in lobes]
-        label = np.unique(np.argmin(misfit, 0), return_inverse=True)[1].reshape(h, w)
+        label = _closest(small, [terms[f.rho] for f in lobes], lobes)
+        label = np.unique(label, return_inverse=True)[1].reshape(h, w)
     lobes = [_fit(small, terms, label == k, whole) for k in range(int(label.max()) + 1)]
 
-    # To full size: each pixel takes the lobe of the fitted pixel that it lies in.
-    label = label[np.ix_(_centres(height, h), _centres(width, w))]
+    # At full size each pixel chooses among the lobes anew.
     full = {
         rho: plane_terms(prepared, height, width, float(ROUGHNESS[rho]), samples)
         for rho in {f.rho for f in lobes}
     }
+    label = _closest(photo, [full[f.rho] for f in lobes], lobes)
     normal = np.zeros((height, width, 3), np.float32)
     normal[..., 2] = 1
     return Maps(
@@ -94,6 +92,13 @@ def fit_lobes(photo: Array, prepared: Tables | Unbiased, samples: int = 64) -> M
 def _centres(n: int, of: int) -> Labels:
     """Which of ``of`` pixels hold the centres of n that span the same length."""
     return ((np.arange(n) + 0.5) / n * of).astype(np.intp)
+
+
+def _closest(photo: Array, terms: list[Any], lobes: list[Lobe]) -> Labels:
+    """Which lobe explains each pixel and its neighbours best."""
+    weight = _weight(photo, photo)
+    misfit = [f.misfit(photo, t, weight) for f, t in zip(lobes, terms, strict=True)]
+    return np.argmin([uniform_filter(m, 3) for m in misfit], 0)
 
 
 def _select(label: Labels, images: list[Array]) -> Array:

@@ -38,7 +38,7 @@ MIN_ROUGHNESS = 0.03
 MAX_SLOPE = 3.0  # 72 degrees
 PHOTO_NOISE = (0.02, 0.01)  # relative to the pixel, and to the photo's mean: sensor and model
 TRUST = (0.1, 0.2)  # how far one step may move roughness and slopes
-STOP = 0.005  # relative decrease of the mean cost below which steps end
+STOP = 0.02  # relative decrease of the mean cost below which steps end
 
 
 @dataclass

@@ -23,11 +23,12 @@ from invrender.fast import shade_fast
 from invrender.maps import Maps
 from invrender.mis import EnvironmentSampler, shade_mis
 from invrender.rig import Rig
-from invrender.scene import Scene, View, make_scene, make_view
+from invrender.scene import Scene, View, aligned, make_scene, make_view
 from invrender.shading import Shading
 from invrender.tables import Tables, fast_tables
 
 TILE = 1 << 20  # pixels rendered at once
+MIN_ROUGHNESS = 1e-3  # a tenth of the model's range; α⁴ must not underflow
 
 
 @dataclass
@@ -68,7 +69,11 @@ def shade(
     samples: int,
     jacobian: bool = False,
 ) -> Shading:
-    """E, B and A of I = k_d·E/π + k_s·B + A at the pixels of a view; normal: unit vectors."""
+    """E, B and A of I = k_d·E/π + k_s·B + A at the pixels of a view; normal: unit vectors.
+
+    Roughness below `MIN_ROUGHNESS` is taken as that.
+    """
+    roughness = dr.maximum(roughness, MIN_ROUGHNESS)
     if isinstance(prepared, Tables):
         return shade_fast(prepared, view, roughness, normal, samples, jacobian)
     return shade_mis(prepared.scene, prepared.sampler, view, roughness, normal, samples, jacobian)
@@ -230,9 +235,7 @@ def material_from_maps(
         flat = image.reshape(-1, image.shape[2] if image.ndim == 3 else 1)[start:stop]
         if len(flat) > 1 and np.all(flat == flat[0]):
             flat = flat[:1]
-        return np.ascontiguousarray(
-            flat.T, dtype=np.float64 if scalar is ad.Float64 else np.float32
-        )
+        return aligned(flat.T.astype(np.float64 if scalar is ad.Float64 else np.float32))
 
     return Material(
         vec3(rows(maps.diffuse)),

@@ -66,11 +66,14 @@ def make_scene(
             raise InputError(f"{name} must be (H, {aspect}H, 3), got {image.shape}")
         if not np.all(np.isfinite(image)) or image.min() < 0:
             raise InputError(f"{name} has negative or non-finite values")
-        return (scalar(image.ravel().astype(np.float64)), image.shape[0]) if image.any() else (
-            None, 0)  # fmt: skip
+        return scalar(image.ravel().astype(np.float64)), image.shape[0]
 
-    flat_pattern, pattern_size = light(pattern, "pattern", 1)
     flat_env, env_height = light(environment, "environment", 2)
+    if environment is not None and not np.any(environment):
+        flat_env, env_height = None, 0
+    flat_pattern, pattern_size = light(pattern, "pattern", 1)
+    if pattern is not None and not np.any(pattern) and flat_env is None:
+        flat_pattern, pattern_size = None, 0  # a black screen matters where it hides something
     edge_x, edge_y = rig.screen_edges
     # Opaque, so that new values of the pose, the gain or the scale do not compile new kernels.
     opaque = lambda v: dr.opaque(scalar, float(v))  # noqa: E731
@@ -182,6 +185,19 @@ def hit_screen(scene: Scene, x: Any, d: Any) -> tuple[Any, Any, Any, Any, Any]:
     """
     s, t, r, cos, ahead = screen_frame(scene, x).hit(d)
     return s, t, r, cos, ahead & (s >= 0) & (s < 1) & (t >= 0) & (t < 1)
+
+
+def aligned(array: np.ndarray) -> np.ndarray:
+    """A copy at a 64-byte boundary.
+
+    Dr.Jit takes numpy memory as it is and compiles its alignment into kernels: left to chance,
+    the same call would now and then compile anew.
+    """
+    buffer = np.empty(array.nbytes + 64, np.uint8)
+    start = -buffer.ctypes.data % 64
+    out = buffer[start : start + array.nbytes].view(array.dtype).reshape(array.shape)
+    out[...] = array
+    return out
 
 
 @dataclass

@@ -119,7 +119,7 @@ def _split_lamps(tables: Tables) -> None:
         _lamp_points(tables, hot)
     without = replace(scene, environment=rest)
 
-    n = min(SKY_TEXELS * _power_of_two(h), 1024)
+    n = min(max(SKY_TEXELS * _power_of_two(h), 256), 1024)
     x, y = _grid(uint, scalar, n)
     px, py = x * 2 - 1, 1 - y * 2
     inside = px * px + py * py < 1
@@ -148,10 +148,11 @@ def _corner_hits(scene: Scene, d: Any, margin: float) -> tuple[Any, Any]:
         return no, no
     vec3 = type(d)
     edge = dr.minimum(dr.norm(scene.edge_x), dr.norm(scene.edge_y))
+    half = dr.opaque(scene.scalar, scene.half)
     hidden: Any = True
     sides: list[Any] = [True] * 4  # all corners beyond the same side of the screen
     for sx, sy in ((-1, -1), (1, -1), (-1, 1), (1, 1)):
-        x = vec3(sx * scene.half, sy * scene.half, 0)
+        x = vec3(sx * half, sy * half, 0)
         s, t, r, cos, _ = hit_screen(scene, x, d)
         width = margin * r / (dr.maximum(cos, 1e-3) * edge)
         up = cos > 1e-3
@@ -201,7 +202,7 @@ def lamp_at(tables: Tables, screen: ScreenFrame | None, i: Any, side: Any) -> tu
     scalar = tables.scene.scalar
     vec3, vec4 = vector(scalar, 3), vector(scalar, 4)
     # Points of the coarser subdivisions come before: 0, 1, 1 + 4, 1 + 4 + 9 a lamp.
-    before = (side - 1) * side * (2 * side - 1) // 6 * tables.lamp_count
+    before = (side - 1) * side * (2 * side - 1) // 6 * dr.opaque(type(i), tables.lamp_count)
     point = dr.gather(vec4, tables.lamp_points, 2 * (before + i))
     d = vec3(point.x, point.y, point.z)
     light = dr.gather(vec3, tables.lamp_radiance, i // (side * side))
@@ -319,8 +320,8 @@ def _catmull_rom(f: Any) -> list[Any]:
 
 
 def screen_cell(tables: Tables, x: Any, i: Any, side: int) -> tuple[Any, Any, Any]:
-    """Cell i of a side × side grid over the screen, seen from x: (unit direction, solid angle,
-    radiance that the screen adds to the sky there), the midpoint rule's nodes."""
+    """Cell i of a side × side grid over the screen, seen from x: (unit direction of its centre,
+    solid angle, radiance that the screen adds to the sky there)."""
     scene = tables.scene
     scalar = scene.scalar
     uint, vec3, vec4 = dr.uint32_array_t(scalar), vector(scalar, 3), vector(scalar, 4)
@@ -328,10 +329,11 @@ def screen_cell(tables: Tables, x: Any, i: Any, side: int) -> tuple[Any, Any, An
     column = i - row * side
     s, t = (scalar(column) + 0.5) / side, 1 - (scalar(row) + 0.5) / side
     to = scene.corner + s * scene.edge_x + t * scene.edge_y - x
-    normal = dr.cross(scene.edge_x, scene.edge_y)
-    distance2 = dr.squared_norm(to)
-    d = to * dr.rsqrt(distance2)
-    omega = dr.maximum(dr.dot(normal, d), 0) / distance2 * (1 / (side * side))
+    area = dr.cross(scene.edge_x, scene.edge_y) * (1 / (side * side))
+    d = dr.normalize(to)
+    facing = dr.maximum(dr.dot(area, d), 0)
+    # The small-angle formula, kept below the half space for cells that are close by.
+    omega = facing / dr.fma(facing, 0.5 / dr.pi, dr.squared_norm(to))
     radiance = vec3(0)
     if tables.screen is not None:
         pyramid = tables.screen
@@ -351,20 +353,40 @@ def screen_cell(tables: Tables, x: Any, i: Any, side: int) -> tuple[Any, Any, An
     return d, omega, radiance
 
 
+def _cell_vector(scene: Scene, x: Any, i: Any, side: int) -> Any:
+    """∫ l dl over cell i, exact for any distance: Lambert's sum over its edges."""
+    scalar = scene.scalar
+    row = i // side
+    column = i - row * side
+    corners = []
+    for ds, dt in ((0, 0), (0, 1), (1, 1), (1, 0)):
+        s, t = scalar(column + ds) / side, 1 - scalar(row + dt) / side
+        corners.append(dr.normalize(scene.corner + s * scene.edge_x + t * scene.edge_y - x))
+    total = type(x)(0)
+    for a, b in zip(corners, [*corners[1:], corners[0]], strict=True):
+        # angle/sin(angle), from the chord: precise for the small angles that cells have
+        chord2 = 0.25 * dr.squared_norm(a - b)
+        half = dr.safe_asin(dr.sqrt(dr.maximum(chord2, 1e-12)))
+        ratio = half * dr.rsqrt(dr.maximum(chord2 * (1 - chord2), 1e-12))
+        total = dr.fma(dr.cross(a, b), 0.5 * ratio, total)
+    return total
+
+
 def _vector_irradiance(tables: Tables) -> Any:
     """V(x) = ∫ (L_screen - L_sky) l dl over the screen's solid angle; flat, 12 values a point."""
     scene = tables.scene
     scalar = scene.scalar
     uint, vec3 = dr.uint32_array_t(scalar), vector(scalar, 3)
+    half = dr.opaque(scalar, scene.half)
     u, v = _grid(uint, scalar, V_SIZE)
     # Nodes at the sample's corners and between, so that no point of it is extrapolated.
     stretch = V_SIZE / (V_SIZE - 1)
-    x = vec3((u - 0.5) * stretch * 2 * scene.half, (0.5 - v) * stretch * 2 * scene.half, scalar(0))
+    x = vec3((u - 0.5) * stretch * 2 * half, (0.5 - v) * stretch * 2 * half, scalar(0))
 
     def body(i: Any, a: Any, b: Any, c: Any) -> tuple[Any, Any, Any, Any]:
-        d, omega, radiance = screen_cell(tables, x, i, QUAD)
-        radiance = radiance * omega
-        return i + 1, a + radiance * d.x, b + radiance * d.y, c + radiance * d.z
+        _, _, radiance = screen_cell(tables, x, i, QUAD)
+        v = _cell_vector(scene, x, i, QUAD)
+        return i + 1, a + radiance * v.x, b + radiance * v.y, c + radiance * v.z
 
     zero = dr.zeros(vec3, V_SIZE * V_SIZE)
     _, a, b, c = dr.while_loop(
@@ -388,9 +410,10 @@ def vector_irradiance_at(tables: Tables, x: Any) -> tuple[Any, Any, Any]:
     scalar = scene.scalar
     uint, vec3, vec4 = dr.uint32_array_t(scalar), vector(scalar, 3), vector(scalar, 4)
     last = V_SIZE - 1
-    px = dr.clip(dr.fma(x.x, 0.5 / scene.half, 0.5) * last, 0, last - 1e-3)
-    py = dr.clip(dr.fma(x.y, -0.5 / scene.half, 0.5) * last, 0, last - 1e-3)
-    ix, iy = uint(px), uint(py)
+    scale = 0.5 * last / dr.opaque(scalar, scene.half)
+    px = dr.clip(dr.fma(x.x, scale, 0.5 * last), 0, last)
+    py = dr.clip(dr.fma(x.y, -scale, 0.5 * last), 0, last)
+    ix, iy = dr.minimum(uint(px), last - 1), dr.minimum(uint(py), last - 1)
     fx, fy = px - scalar(ix), py - scalar(iy)
     i = iy * V_SIZE + ix
     parts = []

@@ -250,7 +250,7 @@ def run(
             scales = []
             with trainer.averaged() as network:
                 for name, folder in valid.items():
-                    result = validate(network, folder, trainer.device)
+                    result = validate(network, folder, trainer.device, limit=args.valid_count)
                     row |= {f"{name}_{k}": v for k, v in result.items()}
                     scales.append([result[f"scale_{k}"] for k in MAPS])
             append_log(args.out / "log.csv", row)
@@ -310,6 +310,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--data", type=Path, required=True, help="folder of shards")
     p.add_argument("--out", type=Path, required=True)
     p.add_argument("--valid", nargs="*", default=[], metavar="NAME=DIR")
+    p.add_argument("--valid-count", type=int, default=256, help="captures of each")
     p.add_argument("--preset", default="small", choices=tuple(PRESETS))
     p.add_argument("--clues", choices=CLUES)
     p.add_argument("--active", choices=("on", "off"))
