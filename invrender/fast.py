@@ -17,6 +17,7 @@ from invrender.pyramid import disc
 from invrender.scene import Scene, ScreenFrame, View, screen_frame, unit
 from invrender.shading import Shading, Sums, with_tangents
 from invrender.tables import (
+    LAMP_SIDES,
     Tables,
     lamp_at,
     screen_cell,
@@ -70,21 +71,35 @@ def shade_fast(
         alpha = dr.detach(rho * rho)
         wide = alpha * alpha * (4 * dr.pi) > scalar(n_samples) * (WIDE * texel * texel)
         count = dr.opaque(uint, tables.lamp_count)
-        # Points a side in each lamp: more where the lobe is narrower than the lamp.
-        side = uint(1) + uint(alpha < 2.5 * texel) + uint(alpha < 0.8 * texel)
-        side = side + uint(alpha < 0.4 * texel)
+        # Points a side in a lamp near the lobe's core: more where that is the narrower one.
+        most = uint(1) + uint(alpha < 2.5 * texel) + uint(alpha < 0.8 * texel)
+        most = most + uint(alpha < 0.4 * texel)
+        core = dr.square(3 * alpha) + dr.square(0.75 * texel)
+        mirror = dr.detach(view.to_camera)
+
+        def side_of(lamp: Any) -> Any:
+            d = lamp_at(tables, None, lamp)[0]
+            h = dr.normalize(d + mirror)
+            return dr.select(1 - dr.square(dr.dot(h, dr.detach(normal))) < core, most, 1)
 
         def lamp_irradiance(i: Any) -> list[list[Any]]:
-            d, light = lamp_at(tables, screen, i, uint(1))
+            d, light = lamp_at(tables, screen, i)
             return along_normal(light, d)
 
         def lamp_lobe(i: Any) -> list[list[Any]]:
-            d, light = lamp_at(tables, screen, i, side)
+            lamp = i // LAMP_SIDES**2
+            d, light = lamp_at(tables, screen, lamp, i - lamp * LAMP_SIDES**2, side_of(lamp))
             rows = sums.derive(lambda r, n: _lobe(view, r * r, n, d), rho, normal)
             return [[light * x for x in row] for row in rows]
 
+        def following(i: Any) -> Any:
+            lamp = i // LAMP_SIDES**2
+            last = i - lamp * LAMP_SIDES**2 + 1 >= dr.square(side_of(lamp))
+            return dr.select(last, (lamp + 1) * LAMP_SIDES**2, i + 1)
+
         sums.run(count, lamp_irradiance, (0,), "lamp irradiance")
-        sums.run(dr.select(wide, side * side * count, 0), lamp_lobe, (1, 2), "lamp lobes")
+        stop = dr.select(wide, count * LAMP_SIDES**2, 0)
+        sums.run(stop, lamp_lobe, (1, 2), "lamp lobes", following=following)
     if tables.screen is not None or tables.sky is not None:
         inv_n = 1 / scalar(n_samples)
 

@@ -79,19 +79,19 @@ class Sums:
         targets: tuple[int, ...],
         label: str,
         factor: Any = 1,
-        start: Any = 0,
+        following: Callable[[Any], Any] = lambda i: i + 1,
     ) -> None:
-        """Add factor · rows(i) for i from start below count, which may differ between pixels."""
+        """Add factor · rows(i) for i = 0, following(0), ... below count, which differs by pixel."""
         uint = type(count)
 
         def body(i: Any, *sums: Any) -> tuple[Any, ...]:
             terms = [x for row in rows(i) for x in row]
-            return (i + 1, *(x + y for x, y in zip(sums, terms, strict=True)))
+            return (following(i), *(x + y for x, y in zip(sums, terms, strict=True)))
 
         step = len(targets)
         zero = dr.zeros(type(self.rows[0][0]), self.width)
         out = dr.while_loop(
-            (dr.zeros(uint, self.width) + start, *(zero for _ in range(step * len(self.rows)))),
+            (dr.zeros(uint, self.width), *(zero for _ in range(step * len(self.rows)))),
             lambda i, *_: i < count,
             body,
             max_iterations=-1,

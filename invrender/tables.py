@@ -197,20 +197,23 @@ def _gauss_tent(n: int) -> tuple[np.ndarray, np.ndarray]:
     return nodes, vectors[0] ** 2
 
 
-def lamp_at(tables: Tables, screen: ScreenFrame | None, i: Any, side: Any) -> tuple[Any, Any]:
-    """Point i of the lamps' side² each: (direction, radiance × solid angle that reaches x)."""
+def lamp_at(
+    tables: Tables, screen: ScreenFrame | None, lamp: Any, k: Any = 0, side: Any = 1
+) -> tuple[Any, Any]:
+    """Point k of side² of a lamp: (direction, radiance × solid angle that reaches x)."""
     scalar = tables.scene.scalar
     vec3, vec4 = vector(scalar, 3), vector(scalar, 4)
     # Points of the coarser subdivisions come before: 0, 1, 1 + 4, 1 + 4 + 9 a lamp.
-    before = (side - 1) * side * (2 * side - 1) // 6 * dr.opaque(type(i), tables.lamp_count)
-    point = dr.gather(vec4, tables.lamp_points, 2 * (before + i))
+    before = (side - 1) * side * (2 * side - 1) // 6 * dr.opaque(type(lamp), tables.lamp_count)
+    i = before + lamp * (side * side) + k
+    point = dr.gather(vec4, tables.lamp_points, 2 * i)
     d = vec3(point.x, point.y, point.z)
-    light = dr.gather(vec3, tables.lamp_radiance, i // (side * side))
+    light = dr.gather(vec3, tables.lamp_radiance, lamp)
     light = light * dr.select(d.z > 0, point.w, 0)
     if screen is None or tables.lamp_open == tables.lamp_count:
         return d, light
     # The screen's edge covers the point's tent bit by bit: project its widths to (s, t).
-    extent = dr.gather(vec4, tables.lamp_points, 2 * (before + i) + 1)
+    extent = dr.gather(vec4, tables.lamp_points, 2 * i + 1)
     ps, pt, r, cos, ahead = screen.hit(d)
     cos = dr.select(ahead, cos, 1)
     inverse_sin2 = dr.rcp(dr.maximum(1 - d.z * d.z, 1e-6))
