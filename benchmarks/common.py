@@ -1,49 +1,81 @@
-"""What every benchmark writes: a table, and results with the machine and versions behind them."""
+"""What the benchmarks share: the machine, timings, results.json and tables."""
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import platform
-from importlib.metadata import PackageNotFoundError, version
+import statistics
+import time
+from collections.abc import Callable
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+PACKAGES = ("drjit", "mitsuba", "numpy", "torch")
+
 
 def machine() -> dict[str, Any]:
-    """Processor, cores and versions: a number means nothing without them."""
-    processor = platform.processor() or platform.machine()
-    info = Path("/proc/cpuinfo")
-    if info.exists():
-        names = [line for line in info.read_text().splitlines() if line.startswith("model name")]
-        processor = names[0].split(":")[1].strip() if names else processor
+    """Processor, cores, and versions of what the numbers depend on."""
+    name = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    flags: list[str] = []
+    mhz = 0.0
+    if cpuinfo.exists():
+        for line in cpuinfo.read_text().splitlines():
+            key, _, value = line.partition(":")
+            key, value = key.strip(), value.strip()
+            if key == "model name":
+                name = value
+            elif key == "flags":
+                flags = value.split()
+            elif key == "cpu MHz":
+                mhz = max(mhz, float(value))
     versions = {}
-    for name in ("invrender", "drjit", "mitsuba", "numpy", "torch"):
+    for package in PACKAGES:
         try:
-            versions[name] = version(name)
-        except PackageNotFoundError:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
             continue
     return {
-        "processor": processor,
+        "cpu": name,
         "cores": os.cpu_count(),
+        "mhz": mhz,
+        "simd_floats": 16 if "avx512f" in flags else 8 if "avx2" in flags else 4,
         "python": platform.python_version(),
         "versions": versions,
     }
 
 
-def save_results(
-    out: Path, name: str, rows: list[dict[str, Any]], bars: list[dict[str, Any]], **more: Any
-) -> None:
-    """Write ``name.csv`` and ``results.json``, and print the bars."""
+def timed(f: Callable[[], Any], repeats: int = 3) -> tuple[float, float]:
+    """(first call's seconds, median seconds of the calls after it)."""
+
+    def once() -> float:
+        start = time.perf_counter()
+        f()
+        return time.perf_counter() - start
+
+    cold = once()
+    return cold, statistics.median(once() for _ in range(repeats))
+
+
+def bar(name: str, value: float, target: float, at_least: bool) -> dict[str, Any]:
+    """One line of ``bars``: whether a measured value reaches its target."""
+    ok = value >= target if at_least else value <= target
+    return {"name": name, "value": value, "bar": target, "ok": bool(ok)}
+
+
+def write_results(out: Path, results: dict[str, Any]) -> None:
+    """results.json with the machine beside the results; prints the bars."""
     out.mkdir(parents=True, exist_ok=True)
-    columns = list(dict.fromkeys(key for row in rows for key in row))
-    with open(out / f"{name}.csv", "w", newline="") as f:
-        writer = csv.DictWriter(f, columns)
-        writer.writeheader()
-        writer.writerows(rows)
-    results = {"benchmark": name, "bars": bars, "machine": machine(), "rows": rows, **more}
-    (out / "results.json").write_text(json.dumps(results, indent=2, default=float) + "\n")
-    for bar in bars:
-        mark = "ok" if bar["ok"] else "MISSED"
-        print(f"{mark:>6}  {bar['name']}: {bar['value']:.4g} (bar {bar['bar']:g})")
+    text = json.dumps({"machine": machine(), **results}, indent=1)
+    (out / "results.json").write_text(text + "\n")
+    for b in results.get("bars", []):
+        print(f"{'ok  ' if b['ok'] else 'MISS'} {b['name']}: {b['value']:.4g} (bar {b['bar']:g})")
+
+
+def markdown(header: list[str], rows: list[list[Any]]) -> str:
+    """A Markdown table."""
+    text = [header, ["---"] * len(header)]
+    text += [[f"{c:.3g}" if isinstance(c, float) else str(c) for c in row] for row in rows]
+    return "\n".join("| " + " | ".join(row) + " |" for row in text) + "\n"

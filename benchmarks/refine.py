@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import save_results
+from common import bar, markdown, write_results
 from matplotlib import pyplot as plt
 
 from invrender.environments import (
@@ -24,6 +24,7 @@ from invrender.environments import (
     rotate_environment,
     scale_environment,
 )
+from invrender.maps import NAMES
 from invrender.materials import find_materials, procedural_material, read_material, resize_maps
 from invrender.pattern import default_pattern
 from invrender.pipeline import refine_capture
@@ -104,13 +105,10 @@ def main() -> None:
     seconds = float(np.median([r["seconds"] for r in rows]))
     photo = total("photo_refined") / total("photo_initial")
     bars = [
-        {"name": "average map error, refined / initial", "value": after / before, "bar": 1.0,
-         "ok": after < before},
-        {"name": "share of captures with lower average map error", "value": better, "bar": 0.5,
-         "ok": better > 0.5},
-        {"name": "photo error, refined / initial", "value": photo, "bar": 0.5, "ok": photo < 0.5},
-        {"name": "seconds a capture, median", "value": seconds, "bar": 60.0, "ok": seconds < 60},
-    ]  # fmt: skip
+        bar("average map error, refined over initial", after / before, 1.0, at_least=False),
+        bar("share of captures with a lower average map error", better, 0.5, at_least=True),
+        bar("seconds a capture, median", seconds, 60.0, at_least=False),
+    ]
 
     figure, axis = plt.subplots(figsize=(6, 4))
     for row in rows:
@@ -121,7 +119,22 @@ def main() -> None:
     axis.set_title("from initial to refined maps, one line a capture")
     figure.tight_layout()
     figure.savefig(args.out / "refine.png", dpi=120)
-    save_results(args.out, "refine", rows, bars)
+    header = ["capture", "seconds", "photo error", *NAMES, "average"]
+    table = [
+        [
+            row["capture"],
+            row["seconds"],
+            *(
+                f"{row[f'{n}_initial']:.4f} → {row[f'{n}_refined']:.4f}"
+                for n in ("photo", *NAMES, "average")
+            ),
+        ]
+        for row in rows
+    ]
+    (args.out / "refine.md").write_text(markdown(header, table))
+    write_results(
+        args.out, {"rows": rows, "photo error, refined over initial": photo, "bars": bars}
+    )
 
 
 if __name__ == "__main__":

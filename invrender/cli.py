@@ -1,4 +1,4 @@
-"""The command line: ``invrender refine`` and ``invrender simulate``."""
+"""The command line: ``invrender refine``, ``simulate`` and ``pattern``."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from invrender import pattern_cli
 from invrender.errors import InputError
 
 EXAMPLE = Path(__file__).parent / "data" / "example"
@@ -89,6 +90,8 @@ def _parser() -> argparse.ArgumentParser:
     simulate.add_argument("--noise", type=float, default=0.005, help="of the sensor (0.005)")
     simulate.add_argument("--seed", type=int, default=0, help="of everything random (0)")
     simulate.set_defaults(run=_simulate)
+
+    pattern_cli.add_parser(commands)
     return parser
 
 

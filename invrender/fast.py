@@ -29,7 +29,7 @@ from invrender.tables import (
 
 SCREEN_BIAS, SKY_BIAS = 0.0, -0.5  # levels added to a look-up whose footprint is a sample's share
 STEEP_SIDE = 16  # screen cells a side where a normal's horizon cuts the screen
-WIDE = 0.01  # a sample's share of the lobe, in texels, from which lamps are summed one by one
+WIDE = 0.05  # a sample's share of the lobe, in texels, from which lamps are summed one by one
 
 
 def shade_fast(

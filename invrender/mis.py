@@ -17,8 +17,8 @@ from invrender.scene import (
     environment_at,
     equirect_uv,
     hash_bits,
-    hit_screen,
     pattern_at,
+    screen_frame,
     unit,
 )
 from invrender.shading import Shading, Sums
@@ -127,7 +127,7 @@ def shade_mis(
     moving = dr.grad_enabled(scene.corner, scene.edge_x, scene.edge_y, scene.camera)
     fixed = dr.detach(scene)
     x, to_camera = dr.detach(view.x), dr.detach(view.to_camera)
-    size = dr.norm(dr.cross(scene.edge_x, scene.edge_y))
+    screen = screen_frame(fixed, x)
     n_samples = dr.opaque(uint, samples)
 
     def lobe(d: Any, rho: Any, n: Any) -> tuple[Any, Any, Any]:
@@ -148,9 +148,9 @@ def shade_mis(
         terms = [vec3(0), vec3(0), vec3(0)]
         on_screen = dr.mask_t(scalar)(False)
         if has_screen:
-            ps, pt, r, cos, on_screen = hit_screen(fixed, x, d)
-            area = dr.detach(size)
-            p_s = r * r / (dr.select(on_screen, cos, 1) * area)
+            ps, pt, r, cos, ahead = screen.hit(d)
+            on_screen = ahead & (ps >= 0) & (ps < 1) & (pt >= 0) & (pt < 1)
+            p_s = r * r / (dr.select(on_screen, cos, 1) * screen.area)
             weight = dr.select(on_screen & (d.z > 0), 1 / (p_s + p_v), 0)
             if kind != "environment":
                 if moving:

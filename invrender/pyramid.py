@@ -28,10 +28,13 @@ class Pyramid:
         texels = dr.zeros(dr.value_t(vec4), 4 * total)
         m, level = n, 0
         while True:
+            # One flat copy, that a level is stored from and the next one averaged from.
+            flat = dr.ravel(image)
             i = dr.arange(uint, m * m)
             row = i // m
             place = level_offset(n, level) + (row + 1) * (m + 2) + (i - row * m) + 1
-            dr.scatter(texels, image, place, mode=dr.ReduceMode.NoConflicts)
+            stored = dr.gather(vec4, flat, i)
+            dr.scatter(texels, stored, place, mode=dr.ReduceMode.NoConflicts)
             if m == 1:
                 return Pyramid(texels, n)
             m //= 2
@@ -39,12 +42,8 @@ class Pyramid:
             i = dr.arange(uint, m * m)
             row = i // m
             j = 4 * m * row + 2 * (i - row * m)
-            image = 0.25 * (
-                dr.gather(vec4, dr.ravel(image), j)
-                + dr.gather(vec4, dr.ravel(image), j + 1)
-                + dr.gather(vec4, dr.ravel(image), j + 2 * m)
-                + dr.gather(vec4, dr.ravel(image), j + 2 * m + 1)
-            )
+            a, b, c, d = (dr.gather(vec4, flat, j + k) for k in (0, 1, 2 * m, 2 * m + 1))
+            image = 0.25 * (a + b + c + d)
 
     @property
     def size(self) -> int:

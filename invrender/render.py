@@ -119,7 +119,6 @@ class _Radiance(dr.CustomOp):
         self.width = {k: dr.width(v) for k, v in zip(
             ("diffuse", "specular", "roughness", "normal"), (diffuse, specular, roughness, normal),
             strict=True)}  # fmt: skip
-        dr.schedule(self.j.__dict__.values())
         return self.j.radiance
 
     def forward(self) -> None:
@@ -186,7 +185,7 @@ def pixel_jacobian(
         k_d, k_s = material.diffuse * (1 / dr.pi), material.specular
         rows = [k_d * e + k_s * b + a for e, b, a in shading.tangents]
         s, t = brdf.frame(n)
-        return PixelJacobian(
+        j = PixelJacobian(
             radiance=_compose(material.diffuse, k_s, shading),
             diffuse=shading.irradiance / dr.pi,
             specular=shading.b,
@@ -196,6 +195,9 @@ def pixel_jacobian(
             s=s,
             t=t,
         )
+        # One kernel, the same whatever is done with its results.
+        dr.eval(list(j.__dict__.values()))
+        return j
 
 
 def render(

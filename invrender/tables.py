@@ -18,7 +18,7 @@ HOT_SHARE = 0.004  # a texel whose flux exceeds this share of the environment's 
 MAX_HOT = 64
 LAMP_SIDES = 4  # at most so many points a side in a lamp, more of them as samples grow
 SCREEN_TEXELS = 256  # at least so many a side on the screen, so that its edge is sharp
-T_SIZE = 32  # normals a side in the table of T
+T_SIZE = 24  # normals a side in the table of T
 T_EXTENT = 1.1  # of its square beyond the unit disc, so that the rim is interpolated too
 V_SIZE = 16  # sample points a side in the table of V
 SKY_TEXELS = 4  # of the disc a side for each row of the environment
@@ -126,14 +126,14 @@ def _split_lamps(tables: Tables) -> None:
     d = disc_direction(dr.select(inside, px, 0), dr.select(inside, py, 0), vec3)
     hidden, _ = _corner_hits(dr.detach(scene), d, 0)
 
-    def pyramid(lit: Scene) -> Pyramid:
+    def image(lit: Scene) -> Any:
         seen = dr.select(inside & ~hidden, environment_at(lit, d), 0)
-        cover = dr.select(inside & hidden, scalar(0), 1)
-        return Pyramid.build(vec4(seen.x, seen.y, seen.z, cover), n)
+        return vec4(seen.x, seen.y, seen.z, dr.select(inside & hidden, scalar(0), 1))
 
-    tables.sky = pyramid(without)
-    if len(hot):
-        tables.sky = Pyramid(dr.concat((tables.sky.texels, pyramid(scene).texels)), n)
+    images = [image(s) for s in ((without, scene) if len(hot) else (without,))]
+    dr.eval(images)
+    pyramids = [Pyramid.build(i, n).texels for i in images]
+    tables.sky = Pyramid(dr.concat(pyramids) if len(hot) else pyramids[0], n)
 
 
 def _corner_hits(scene: Scene, d: Any, margin: float) -> tuple[Any, Any]:
@@ -262,14 +262,16 @@ def _sky_irradiance(tables: Tables) -> Any:
     level = max(sky.n.bit_length() - 7, 0)  # 64 × 64 directions
     m = sky.n >> level
     # The table reaches past the rim, so that interpolation near it reads sensible normals.
-    x, y = _grid(uint, scalar, T_SIZE)
-    x, y = (x * 2 - 1) * T_EXTENT, (y * 2 - 1) * T_EXTENT
+    # A lane sums a row of directions for a normal: the table alone would keep few cores busy.
+    lane = dr.arange(uint, T_SIZE * T_SIZE * m)
+    row = lane % m
+    i = lane // m
+    x, y = scalar(i % T_SIZE) + 0.5, scalar(i // T_SIZE) + 0.5
+    x, y = (x * (2 / T_SIZE) - 1) * T_EXTENT, (y * (2 / T_SIZE) - 1) * T_EXTENT
     scale = dr.minimum(1, 1.3 * dr.rsqrt(dr.maximum(x * x + y * y, 1e-12)))
     normal = disc_direction(x * scale, y * scale, vec3)
 
-    def body(i: Any, total: Any) -> tuple[Any, Any]:
-        row = i // m
-        column = i - row * m
+    def body(column: Any, total: Any) -> tuple[Any, Any]:
         px = (scalar(column) + 0.5) * (2 / m) - 1
         py = 1 - (scalar(row) + 0.5) * (2 / m)
         inside = px * px + py * py < 1.02
@@ -277,17 +279,18 @@ def _sky_irradiance(tables: Tables) -> Any:
         texel = level_offset(sky.n, level) + (row + 1) * (m + 2) + column + 1
         radiance = dr.gather(vec4, sky.texels, texel, inside)
         cos = dr.maximum(dr.dot(normal, d), 0)
-        return i + 1, total + cos * vec3(radiance.x, radiance.y, radiance.z)
+        return column + 1, total + cos * vec3(radiance.x, radiance.y, radiance.z)
 
     _, total = dr.while_loop(
-        (dr.opaque(uint, 0), dr.zeros(vec3, T_SIZE * T_SIZE)),
-        lambda i, _: i < dr.opaque(uint, m * m),
+        (dr.zeros(uint, len(lane)), dr.zeros(vec3, len(lane))),
+        lambda column, _: column < dr.opaque(uint, m),
         body,
         max_iterations=-1,
         label="sky irradiance",
     )
-    total *= 8 / (m * m)
-    return dr.ravel(vec4(total.x, total.y, total.z, 0))
+    dr.eval(total)
+    r, g, b = (dr.block_sum(c, m) * (8 / (m * m)) for c in total)
+    return dr.ravel(vec4(r, g, b, 0))
 
 
 def sky_irradiance_at(tables: Tables, n: Any) -> Any:
@@ -381,28 +384,21 @@ def _vector_irradiance(tables: Tables) -> Any:
     scalar = scene.scalar
     uint, vec3 = dr.uint32_array_t(scalar), vector(scalar, 3)
     half = dr.opaque(scalar, scene.half)
-    u, v = _grid(uint, scalar, V_SIZE)
+    cells = QUAD * QUAD
+    lane = dr.arange(uint, V_SIZE * V_SIZE * cells)
+    i = lane // cells
     # Nodes at the sample's corners and between, so that no point of it is extrapolated.
-    stretch = V_SIZE / (V_SIZE - 1)
-    x = vec3((u - 0.5) * stretch * 2 * half, (0.5 - v) * stretch * 2 * half, scalar(0))
-
-    def body(i: Any, a: Any, b: Any, c: Any) -> tuple[Any, Any, Any, Any]:
-        _, _, radiance = screen_cell(tables, x, i, QUAD)
-        v = _cell_vector(scene, x, i, QUAD)
-        return i + 1, a + radiance * v.x, b + radiance * v.y, c + radiance * v.z
-
-    zero = dr.zeros(vec3, V_SIZE * V_SIZE)
-    _, a, b, c = dr.while_loop(
-        (dr.opaque(uint, 0), zero, vec3(zero), vec3(zero)),
-        lambda i, *_: i < dr.opaque(uint, QUAD * QUAD),
-        body,
-        max_iterations=-1,
-        label="vector irradiance",
-    )
+    u, v = scalar(i % V_SIZE) / (V_SIZE - 1), scalar(i // V_SIZE) / (V_SIZE - 1)
+    x = vec3((2 * u - 1) * half, (1 - 2 * v) * half, scalar(0))
+    _, _, light = screen_cell(tables, x, lane % cells, QUAD)
+    direction = _cell_vector(scene, x, lane % cells, QUAD)
+    terms = [light * direction[k] for k in range(3)]
+    dr.eval(terms)
+    parts = [vec3(*(dr.block_sum(c, cells) for c in term)) for term in terms]
     flat = dr.zeros(scalar, 12 * V_SIZE * V_SIZE)
     i = dr.arange(uint, V_SIZE * V_SIZE) * 3
     vec4 = vector(scalar, 4)
-    for k, part in enumerate((a, b, c)):
+    for k, part in enumerate(parts):
         dr.scatter(flat, vec4(part.x, part.y, part.z, 0), i + k, mode=dr.ReduceMode.NoConflicts)
     return flat
 

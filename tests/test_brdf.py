@@ -91,7 +91,9 @@ def test_visible_normals_follow_their_density(elevation, roughness):
 
 def test_cosine_samples_follow_their_density():
     rng = np.random.default_rng(0)
-    d = np.array(brdf.sample_cosine(Float64(rng.random(100_000)), Float64(rng.random(100_000)), Vec))
+    d = np.array(
+        brdf.sample_cosine(Float64(rng.random(100_000)), Float64(rng.random(100_000)), Vec)
+    )
     assert np.allclose(np.linalg.norm(d, axis=0), 1)
     # P(z² < a) = a for density z/π
     found = np.histogram(d[2] ** 2, 20, (0, 1))[0]
@@ -150,8 +152,12 @@ def test_float32_agrees_with_float64():
     rng = np.random.default_rng(0)
     v = random_directions(n, 5, 0.02)
     alpha = np.exp(rng.uniform(np.log(1e-4), 0, n))
-    h = np.array(brdf.sample_vndf(v, Float64(alpha), Float64(rng.random(n)), Float64(rng.random(n))))
+    h = np.array(
+        brdf.sample_vndf(v, Float64(alpha), Float64(rng.random(n)), Float64(rng.random(n)))
+    )
     h32 = h.astype(np.float32)
     a = np.array(brdf.ggx_d(vector(Float, 3)(h32), Float(alpha.astype(np.float32))), np.float64)
-    b = np.array(brdf.ggx_d(Vec(h32.astype(float)), Float64(alpha.astype(np.float32).astype(float))))
+    b = np.array(
+        brdf.ggx_d(Vec(h32.astype(float)), Float64(alpha.astype(np.float32).astype(float)))
+    )
     assert np.abs(a / b - 1).max() < 1e-4

@@ -5,7 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from forward_scenes import configuration_view, extreme_configurations, some_environment, some_pattern
+from forward_scenes import (
+    configuration_view,
+    extreme_configurations,
+    some_environment,
+    some_pattern,
+)
 
 from invrender import render
 from invrender.backend import Float, ad
@@ -116,7 +121,9 @@ def test_no_energy_is_created(estimator, roughness):
             shading = render.shade(
                 render.prepare(scene, estimator), view, m.roughness, m.normal, 256
             )
-            lobe = np.array(shading.irradiance) / np.pi if diffuse else np.array(shading.b + shading.a)
+            lobe = (
+                np.array(shading.irradiance) / np.pi if diffuse else np.array(shading.b + shading.a)
+            )
             slack = 0.01 if estimator == "fast" else 0.15
             assert lobe.mean() <= 1.0005 and lobe.max() <= 1 + slack, (lobe.mean(), lobe.max())
 
