@@ -103,7 +103,7 @@ class Case:
         }
 
     def prepare(self, estimator: str) -> Any:
-        prepared = render.prepare(self.scene, estimator)
+        prepared: Any = render.prepare(self.scene, estimator)
         if estimator == "fast":
             dr.eval(prepared.sky.texels, prepared.screen.texels)
             dr.eval(prepared.sky_irradiance, prepared.vector_irradiance)
@@ -423,7 +423,8 @@ def forward_backward(case: Case, samples: int, repeats: int) -> dict[str, float]
             dr.sync_thread()
 
         # Interleaved, so that other work on the machine slows both alike.
-        forward(), both()
+        forward()
+        both()
         pairs = []
         for _ in range(repeats):
             start = time.perf_counter()

@@ -129,8 +129,8 @@ class _Sample:
 
     weight: Any
     fresnel: Any
-    screen: list[Any]
-    sky: list[Any]
+    screen: Any
+    sky: Any
 
     def flat(self) -> tuple[Any, ...]:
         return (self.weight, self.fresnel, *self.screen, *self.sky)
@@ -215,7 +215,8 @@ def _specular(tables: Tables, sample: _Sample, wide: Any) -> list[Any]:
         rgba = tables.screen(*sample.screen)
         light, share = _rgb(rgba), 1 - rgba.w
     if tables.sky is not None:
-        rgba = tables.sky(*sample.sky, _base(tables, wide))
+        x, y, level = sample.sky
+        rgba = tables.sky(x, y, level, _base(tables, wide))
         light = light + _rgb(rgba) * (share / dr.maximum(rgba.w, MIN_COVER))
     light = light * sample.weight
     return [light * (1 - sample.fresnel), light * sample.fresnel]
@@ -240,7 +241,8 @@ def _specular_rows(
             d = chain(slopes, t.screen)
             d_light[k], d_share[k] = _rgb(d), -d.w
     if tables.sky is not None:
-        rgba, *slopes = tables.sky.slopes(*sample.sky, _base(tables, wide))
+        x, y, level = sample.sky
+        rgba, *slopes = tables.sky.slopes(x, y, level, _base(tables, wide))
         inverse = 1 / dr.maximum(rgba.w, MIN_COVER)
         sky, share = _rgb(rgba), share * inverse
         light = light + sky * share

@@ -231,7 +231,7 @@ def test_fast_is_exact_without_lamps():
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_nothing_is_recompiled(estimator):
-    """New seeds, sample counts, map values, gains, lights and rigs reuse the first call's kernels."""
+    """New seeds, sample counts, maps, gains, lights and rigs reuse the first call's kernels."""
     rng = np.random.default_rng(0)
 
     def call(k):

@@ -131,10 +131,10 @@ def test_a_photo_never_makes_maps_less_certain(criterion):
 
 
 def test_brightness_alone_matters_little_colour_much(criterion):
-    # Exposure follows the photo; a brighter screen only outshines the room.
+    # Exposure follows the photo: a dimmer screen only changes how much of it the room is.
     white = np.ones((SIDE, SIDE, 3))
     full, half = (criterion.errors(white * k)["criterion"] for k in (1.0, 0.5))
-    assert full < half < 1.2 * full
+    assert half == pytest.approx(full, rel=0.1)
     assert criterion.errors(wheel(SIDE))["criterion"] < 0.85 * full
 
 
@@ -200,4 +200,4 @@ def test_command_optimises_for_another_rig(tmp_path):
     assert run("-o", tmp_path / "p.exr", "--optimise", "--rig", tmp_path / "rig.toml") == 0
     pattern = read_image(tmp_path / "p.exr")
     assert pattern.shape == (1024, 1024, 3)
-    assert 0 <= pattern.min() and pattern.max() <= 1 and pattern.std() > 0.2
+    assert pattern.min() >= 0 and pattern.max() <= 1 and pattern.std() > 0.2

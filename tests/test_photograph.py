@@ -12,7 +12,7 @@ def sample_region(rig, photo, n):
     height, width = photo.shape[:2]
     half = rig.sample_size / 2
     corners = rig.project(np.array([[-half, half, 0.0], [half, -half, 0.0]]), height, width)
-    (x0, y0), (x1, y1) = np.rint(corners).astype(int)
+    (x0, y0), (x1, _) = np.rint(corners).astype(int)
     k = (x1 - x0) // n
     crop = photo[y0 : y0 + n * k, x0 : x0 + n * k]
     return crop.reshape(n, k, n, k, 3).mean((1, 3))

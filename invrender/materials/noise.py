@@ -1,9 +1,9 @@
 """The noise that procedural materials are made of, the same at every resolution.
 
 Every pattern here and in `invrender.materials.patterns` is a function of position, evaluated at
-the pixel centres of a `Canvas` whose longer side has length 1, from random numbers that do not depend on the
-number of pixels: the same seed at twice the resolution gives the same pattern with finer detail.
-All fields are (H, W) float32.
+the pixel centres of a `Canvas` whose longer side has length 1, from random numbers that do not
+depend on the number of pixels: the same seed at twice the resolution gives the same pattern with
+finer detail. All fields are (H, W) float32.
 """
 
 from __future__ import annotations
