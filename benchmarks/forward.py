@@ -33,6 +33,7 @@ from invrender.maps import Maps
 from invrender.photograph import mi
 from invrender.rig import Rig
 from invrender.scene import make_scene, make_view
+from invrender.tables import Tables
 
 Array = NDArray[Any]
 # The sample's pixels are whole pixels of a film 2.5 samples wide: δ = 3/32 l.
@@ -104,8 +105,9 @@ class Case:
 
     def prepare(self, estimator: str) -> Any:
         prepared: Any = render.prepare(self.scene, estimator)
-        if estimator == "fast":
-            dr.eval(prepared.sky.texels, prepared.screen.texels)
+        if isinstance(prepared, Tables):
+            for pyramid in (prepared.sky, prepared.screen):
+                dr.eval(pyramid.texels if pyramid else 0)
             dr.eval(prepared.sky_irradiance, prepared.vector_irradiance)
             dr.sync_thread()
         return prepared
@@ -374,10 +376,9 @@ def work(n: int, samples: int) -> dict[str, Any]:
     source = max((k["ir"].getvalue() for k in kernels), key=len)
     operations, gathers, inside = 0, 0, False
     for line in source.splitlines():
-        # Loops are named after their labels; the specular one is the last.
-        if "loop_body_specular" in line or ("; Loop" in line and "specular" in line):
-            inside = True
-        elif "; Loop" in line and "end" in line:
+        if "; Symbolic loop: " in line:
+            inside = line.endswith("specular")
+        elif line.endswith("_end:"):
             inside = False
         if not inside:
             continue
@@ -385,7 +386,7 @@ def work(n: int, samples: int) -> dict[str, Any]:
             operations += 1
         elif "@llvm.fma" in line:
             operations += 2
-        elif "gather" in line and "call" in line:
+        elif "gather" in line:
             gathers += 1
     slope = timed(lambda: run(2 * samples), 5)[1] - timed(lambda: run(samples), 5)[1]
     rate = n * n * samples / max(slope, 1e-9)

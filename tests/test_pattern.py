@@ -14,6 +14,7 @@ from invrender.design import (
     GROUP,
     NAMES,
     Criterion,
+    design,
     draw_population,
     measure_responses,
     optimise,
@@ -144,6 +145,17 @@ def test_optimise_lowers_the_criterion_within_the_range_and_repeats(criterion):
     assert criterion(found)[0] < criterion(start)[0] - 0.003
     assert found.min() >= DARKEST and found.max() <= 1
     assert np.array_equal(found, optimise(criterion, start, iterations=12))
+
+
+def test_design_beats_what_it_is_compared_with_on_pixels_it_has_not_seen():
+    steps: list[float] = []
+    white = {"white": np.ones((SIDE, SIDE, 3))}
+    found = design(
+        RIG, white, groups=16, iterations=4, samples=16, cells=SIDE, rooms=1, progress=steps.append
+    )
+    assert found.pattern.shape == (SIDE, SIDE, 3)
+    assert found.errors["optimised"]["criterion"] < 0.8 * found.errors["white"]["criterion"]
+    assert steps == sorted(steps) and steps[-1] <= 1
 
 
 def test_population_is_seeded_and_in_range():

@@ -103,6 +103,7 @@ def design(
     samples: int = 128,
     seed: int = 0,
     cells: int = CELLS,
+    rooms: int = 12,
     progress: Callable[[float], None] | None = None,
 ) -> Design:
     """Optimise a pattern for a rig from several starts; the best on a held-out population wins.
@@ -110,11 +111,12 @@ def design(
     compare: patterns (cells, cells, 3) to report beside it. progress: called with 0 to 1.
     """
     tell = progress or (lambda _: None)
-    measure = lambda count, s, a, b: Criterion(  # noqa: E731
-        measure_responses(
-            rig, draw_population(rig, count, s), cells, samples, lambda f: tell(a + f * (b - a))
-        )
-    )
+
+    def measure(count: int, population_seed: int, begin: float, end: float) -> Criterion:
+        population = draw_population(rig, count, population_seed, rooms)
+        report = lambda f: tell(begin + f * (end - begin))  # noqa: E731
+        return Criterion(measure_responses(rig, population, cells, samples, report))
+
     train = measure(groups, 2 * seed + 1, 0.0, 0.35)
     held_out = measure(max(groups // 2, 1), 2 * seed + 2, 0.35, 0.55)
     rng = np.random.default_rng(seed)
