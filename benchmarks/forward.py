@@ -222,7 +222,7 @@ def prb_gradients(case: Case, adjoint: Array) -> Callable[[int, int], list[Array
     n, size = case.n, RIG.screen_size
     scene = case.mitsuba["path"]
     params = mi.traverse(scene)
-    keys = {name: next(k for k in params if k.endswith(f".{name}")) for name in MAPS}
+    keys = {name: next(k for k, _ in params if k.endswith(f".{name}")) for name in MAPS}
     half = 0.625 * size
     sensor = mi.load_dict(
         {
