@@ -169,31 +169,46 @@ def draw_environment(rng: np.random.Generator, options: Options) -> Array:
 
 
 def draw_rigs(rng: np.random.Generator) -> tuple[Rig, Rig]:
-    """(what the user measured, what it really is).
+    """(what the user measured or the ball showed, what it really is).
 
-    Only proportions matter to the picture, so the screen's size stays.
+    Only proportions matter to the picture, so the screen's size stays. Some rigs are held by hand:
+    shifted by up to a tenth of the sample and tilted by up to 10 degrees, and known to be.
     """
     d = Rig()
+
     known = replace(
         d,
         screen_height=d.screen_height * float(np.exp(0.03 * rng.standard_normal())),
         camera_offset=float(max(d.camera_offset + 0.001 * rng.standard_normal(), 0.01)),
     )
+    if rng.random() < 0.35:
+        loose = float(rng.uniform(0, 1))
+        shift = loose * 0.1 * d.sample_size * rng.uniform(-1, 1, 3) * (1, 1, 0.5)
+        tilt = loose * 10 * rng.uniform(-1, 1, 3)
+        known = replace(known, screen_shift=_vec3(shift), screen_tilt=_vec3(tilt))
     if rng.random() < 0.3:
         return known, known
-
-    def vector(sigma: float) -> tuple[float, float, float]:
-        x, y, z = sigma * rng.standard_normal(3)
-        return float(x), float(y), float(z)
-
     wrong = float(rng.uniform(0, 1))
+    shift, tilt, camera = wrong * rng.standard_normal((3, 3)) * [[0.0015], [0.6], [0.0015]]
     true = replace(
         known,
-        screen_shift=vector(0.0015 * wrong),
-        screen_tilt=vector(0.6 * wrong),
-        camera_shift=vector(0.0015 * wrong),
+        screen_shift=_vec3(shift + known.screen_shift),
+        screen_tilt=_vec3(tilt + known.screen_tilt),
+        camera_shift=_vec3(camera),
     )
     return known, true
+
+
+def _vec3(v: Array) -> tuple[float, float, float]:
+    return float(v[0]), float(v[1]), float(v[2])
+
+
+def draw_pattern(rng: np.random.Generator, pattern: Array) -> Array:
+    """The pattern as a screen shows it whose curve and white balance the ball told us."""
+    if rng.random() < 0.6:
+        return pattern
+    curve = 2.2 ** rng.uniform(-1, 1)
+    return (pattern**curve * np.exp(np.log(1.25) * rng.uniform(-1, 1, 3))).astype(np.float32)
 
 
 def display(rng: np.random.Generator, pattern: Array) -> Array:
@@ -256,7 +271,7 @@ def sensor(rng: np.random.Generator, image: Array) -> Array:
 def make_group(rng: np.random.Generator, options: Options) -> list[Sample]:
     """``per_room`` captures in one room with one rig. Fewer if some come out degenerate."""
     known, true = draw_rigs(rng)
-    pattern = light_pattern_cached(options.pattern)
+    pattern = draw_pattern(rng, light_pattern_cached(options.pattern))
     shown = display(rng, pattern)
     # Irradiance of the room relative to the screen's, from a dark room to a bright one.
     ratio = np.exp(rng.uniform(np.log(0.05), np.log(6.0)))
