@@ -65,7 +65,7 @@ SLOW = pytest.mark.slow  # more kernels to compile, no more code to cover
 CASES = [
     ("fast", "both"),
     ("mis", "both"),
-    ("fast", "environment"),
+    pytest.param("fast", "environment", marks=SLOW),
     pytest.param("fast", "screen", marks=SLOW),
     pytest.param("mis", "screen", marks=SLOW),
     pytest.param("mis", "environment", marks=SLOW),
@@ -277,7 +277,9 @@ def pose_tangent(lights, field, axis):
     return replace(scene, **fields), list(fields.values())
 
 
-@pytest.mark.parametrize("field, axis", POSES)
+@pytest.mark.parametrize(
+    "field, axis", [p if i % 2 == 0 else pytest.param(*p, marks=SLOW) for i, p in enumerate(POSES)]
+)
 def test_pose_derivatives_fast(field, axis):
     """Pixel by pixel: the fast estimator's edges are soft, so its derivative has no jumps."""
     n, samples = 16, 16

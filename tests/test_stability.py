@@ -73,8 +73,13 @@ def jacobian(estimator, scene_name, c, scalar, samples=16):
     return {k: np.array(v, np.float64) for k, v in j.__dict__.items() if k not in "st"}
 
 
-@pytest.mark.parametrize("estimator", ESTIMATORS)
-@pytest.mark.parametrize("name", list(SCENES))
+QUICK = ("ordinary", "sun of 1e5 in a texel", "screen at 1 mm", "one texel", "denormal light")
+CASES = [("fast", name) for name in SCENES] + [
+    pytest.param("mis", name, marks=[] if name in QUICK else pytest.mark.slow) for name in SCENES
+]
+
+
+@pytest.mark.parametrize("estimator, name", CASES)
 def test_extreme_scenes(name, estimator, capsys):
     """512 extreme materials in each extreme scene.
 
