@@ -344,12 +344,12 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 
 def write_exr(path: Path, image: Array, *, half: bool = False) -> None:
-    """Write (H, W) or (H, W, 3) linear values; refuses NaN and infinity."""
+    """Write (H, W), (H, W, 3) or (H, W, 4) linear values; refuses NaN and infinity."""
     image = np.asarray(image)
     if not np.all(np.isfinite(image)):
         raise ValueError(f"refusing to write non-finite values to {path}")
     data = np.ascontiguousarray(image.astype(np.float16 if half else np.float32))
-    channel = {"RGB" if data.ndim == 3 else "Y": data}
+    channel = {"Y" if data.ndim == 2 else "RGBA"[: data.shape[2]]: data}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with atomic_path(path) as temporary, OpenEXR.File(header, channel) as f:
         f.write(str(temporary))
