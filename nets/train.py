@@ -34,10 +34,11 @@ EMA_DECAY = 0.999
 
 
 def learning_rate(step: int, steps: int, peak: float, last: float = 1e-7, warm: int = 200) -> float:
-    """Linear to ``peak`` within ``warm`` steps, then half a cosine to ``last``."""
+    """Linear to ``peak`` within ``warm`` steps, ``peak``, and over the last quarter half a cosine
+    to ``last``. So a training may be prolonged from a state before the last quarter."""
     if step < warm:
         return peak * (step + 1) / warm
-    x = min((step - warm) / max(steps - warm, 1), 1)
+    x = min(max(4 * step / max(steps, 1) - 3, 0), 1)
     return last + (peak - last) * 0.5 * (1 + math.cos(math.pi * x))
 
 
@@ -51,7 +52,7 @@ class Trainer:
         if torch.distributed.is_initialized():
             self.module = DistributedDataParallel(self.network)
         self.optimiser = torch.optim.AdamW(
-            self.network.parameters(), lr=1e-3, betas=(0.9, 0.9), weight_decay=decay
+            self.network.parameters(), lr=1e-3, betas=(0.9, 0.9), weight_decay=decay, fused=True
         )
         self.mean = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
         self.step = self.skipped = 0

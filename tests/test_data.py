@@ -227,9 +227,10 @@ def test_steps_that_are_not_finite_are_skipped(folder, tmp_path):
 
 
 def test_schedule():
-    rates = [train.learning_rate(s, 1000, 1e-3) for s in (0, 199, 200, 600, 1000)]
+    rates = [train.learning_rate(s, 1000, 1e-3) for s in (0, 199, 200, 750, 875, 1000)]
     assert rates[0] == pytest.approx(5e-6) and rates[1] == rates[2] == pytest.approx(1e-3)
-    assert rates[3] == pytest.approx(5e-4, rel=0.01) and rates[4] == pytest.approx(1e-7)
+    assert rates[3] == rates[1] and rates[4] == pytest.approx(5e-4, rel=0.01)
+    assert rates[5] == pytest.approx(1e-7)
 
 
 def test_calibration_and_baseline(folder):
