@@ -89,9 +89,9 @@ class Case:
     def prepare(self, estimator: str) -> Any:
         prepared: Any = render.prepare(self.scene, estimator)
         if isinstance(prepared, Tables):
-            for pyramid in (prepared.sky, prepared.screen):
-                dr.eval(pyramid.texels if pyramid else 0)
-            dr.eval(prepared.sky_irradiance, prepared.vector_irradiance)
+            tables = (prepared.sky, prepared.screen)
+            grids = (prepared.sky_irradiance, prepared.vector_irradiance)
+            dr.eval([p.texels for p in tables if p], [g.values for g in grids if g])
             dr.sync_thread()
         return prepared
 

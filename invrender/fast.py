@@ -13,19 +13,12 @@ from typing import Any
 
 from invrender import brdf
 from invrender.backend import dr, vector
-from invrender.pyramid import disc
+from invrender.irradiance import screen_cell
+from invrender.lamps import LAMP_SIDES
+from invrender.pyramid import disc, disc_level, square_level
 from invrender.scene import Scene, ScreenFrame, View, screen_frame, unit
 from invrender.shading import Shading, Sums, with_tangents
-from invrender.tables import (
-    LAMP_SIDES,
-    Tables,
-    lamp_at,
-    screen_cell,
-    screen_level,
-    sky_irradiance_at,
-    sky_level,
-    vector_irradiance_at,
-)
+from invrender.tables import Tables
 
 SCREEN_BIAS, SKY_BIAS = 0.0, -0.5  # levels added to a look-up whose footprint is a sample's share
 STEEP_SIDE = 16  # screen cells a side where a normal's horizon cuts the screen
@@ -56,21 +49,23 @@ def shade_fast(
 
     sums.add(sums.derive(lambda _, n: (_smooth_irradiance(tables, view, n),), rho, normal), (0,))
     if screen is not None:
-        cells = dr.select(_is_steep(scene, view, normal), uint(STEEP_SIDE**2), uint(0))
+        side = STEEP_SIDE * tables.detail
+        cells = dr.select(_is_steep(scene, view, normal), uint(side * side), uint(0))
 
         def steep(i: Any) -> list[list[Any]]:
-            d, omega, light = screen_cell(tables, view.x, i, STEEP_SIDE)
+            d, omega, light = screen_cell(scene, tables.screen, tables.sky, view.x, i, side)
             return along_normal(light * omega, d, -1)
 
         sums.run(dr.detach(cells), steep, (0,), "steep")
 
     n_samples = dr.opaque(uint, samples)
     wide = None
-    if tables.lamp_count:
+    lamps = tables.lamps
+    if lamps is not None:
         texel = dr.pi / scene.env_height
         alpha = dr.detach(rho * rho)
         wide = alpha * alpha * (4 * dr.pi) > scalar(n_samples) * (WIDE * texel * texel)
-        count = dr.opaque(uint, tables.lamp_count)
+        count = dr.opaque(uint, lamps.count)
         # Points a side in a lamp near the lobe's core: more where that is the narrower one.
         most = uint(1) + uint(alpha < 2.5 * texel) + uint(alpha < 0.8 * texel)
         most = most + uint(alpha < 0.4 * texel)
@@ -78,17 +73,17 @@ def shade_fast(
         mirror = dr.detach(view.to_camera)
 
         def side_of(lamp: Any) -> Any:
-            d = lamp_at(tables, None, lamp)[0]
+            d = lamps.at(None, lamp)[0]
             h = dr.normalize(d + mirror)
             return dr.select(1 - dr.square(dr.dot(h, dr.detach(normal))) < core, most, 1)
 
         def lamp_irradiance(i: Any) -> list[list[Any]]:
-            d, light = lamp_at(tables, screen, i)
+            d, light = lamps.at(screen, i)
             return along_normal(light, d)
 
         def lamp_lobe(i: Any) -> list[list[Any]]:
             lamp = i // LAMP_SIDES**2
-            d, light = lamp_at(tables, screen, lamp, i - lamp * LAMP_SIDES**2, side_of(lamp))
+            d, light = lamps.at(screen, lamp, i - lamp * LAMP_SIDES**2, side_of(lamp))
             rows = sums.derive(lambda r, n: _lobe(view, r * r, n, d), rho, normal)
             return [[light * x for x in row] for row in rows]
 
@@ -175,18 +170,18 @@ def _sample(
     pdf = brdf.ggx_d(h, alpha) / (2 * (v.z + root_v))
     omega = dr.minimum(inv_n / pdf, 2 * dr.pi)
     on_screen, on_sky = [], []
-    if screen is not None:
+    if screen is not None and tables.screen is not None:
         ps, pt, r, cos, ahead = screen.hit(d)
         area = omega * r * r / (dr.select(ahead, cos, 1) * screen.area)
         # What does not meet the plane reads far outside.
         on_screen = [
             dr.select(ahead, ps, -8),
             dr.select(ahead, 1 - pt, -8),
-            screen_level(tables, area) + SCREEN_BIAS,
+            square_level(tables.screen.n, area) + SCREEN_BIAS,
         ]
     if tables.sky is not None:
         x, y = disc(d)
-        level = sky_level(tables, omega) + SKY_BIAS
+        level = disc_level(tables.sky.n, omega) + SKY_BIAS
         on_sky = [dr.fma(x, 0.5, 0.5), dr.fma(y, -0.5, 0.5), level]
     return _Sample(dr.select(valid, weight, 0), brdf.schlick(v_h), on_screen, on_sky)
 
@@ -273,9 +268,9 @@ def _smooth_irradiance(tables: Tables, view: View, n: Any) -> Any:
     """Irradiance E without lamps for a screen wholly above the normal's horizon."""
     total = vector(tables.scene.scalar, 3)(0)
     if tables.sky_irradiance is not None:
-        total = total + sky_irradiance_at(tables, n)
-    if tables.vector_irradiance is not None and tables.screen is not None:
-        a, b, c = vector_irradiance_at(tables, view.x)
+        total = total + tables.sky_irradiance(n)
+    if tables.vector_irradiance is not None:
+        a, b, c = tables.vector_irradiance(view.x)
         total = total + a * n.x + b * n.y + c * n.z
     return total
 

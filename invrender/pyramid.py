@@ -116,3 +116,14 @@ def disc_direction(x: Any, y: Any, vec3: type) -> Any:
     r2 = x * x + y * y
     q = dr.safe_sqrt(2 - r2)
     return vec3(x * q, y * q, 1 - r2)
+
+
+def disc_level(n: int, solid_angle: Any) -> Any:
+    """Level of an n × n image of the disc whose texels are about as large as ``solid_angle``."""
+    # A texel of the disc has area (2/n)² and twice that in solid angle.
+    return 0.5 * dr.log2(solid_angle * (n * n / 8))
+
+
+def square_level(n: int, area: Any) -> Any:
+    """Level of an n × n image of the unit square whose texels are about ``area``."""
+    return 0.5 * dr.log2(area * (n * n))

@@ -52,10 +52,13 @@ class Unbiased:
     sampler: EnvironmentSampler | None
 
 
-def prepare(scene: Scene, estimator: str = "fast") -> Tables | Unbiased:
-    """Precompute what an estimator, ``fast`` or ``mis``, needs to know of a scene's lights."""
+def prepare(scene: Scene, estimator: str = "fast", detail: int = 1) -> Tables | Unbiased:
+    """Precompute what an estimator, ``fast`` or ``mis``, needs to know of a scene's lights.
+
+    detail: a power of two that multiplies the sizes of the fast one's tables.
+    """
     if estimator == "fast":
-        return fast_tables(scene)
+        return fast_tables(scene, detail)
     if estimator == "mis":
         return Unbiased(scene, EnvironmentSampler.build(scene))
     raise ValueError(f"estimator must be 'fast' or 'mis', got {estimator!r}")

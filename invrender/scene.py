@@ -35,7 +35,7 @@ class Scene:
     environment: Any | None
     env_height: int
     scale: Any
-    half: float  # half-width of the sample, metres
+    half: Any  # half-width of the sample, metres
 
     @property
     def scalar(self) -> type:
@@ -89,7 +89,7 @@ def make_scene(
         environment=flat_env,
         env_height=env_height,
         scale=opaque(scale),
-        half=rig.sample_size / 2,
+        half=opaque(rig.sample_size / 2),
     )
 
 
@@ -219,10 +219,9 @@ def make_view(
     i = dr.arange(uint, count) + dr.opaque(uint, start)
     w, h = dr.opaque(uint, width), dr.opaque(uint, height)
     row = i // w
-    half = dr.opaque(scalar, scene.half)
     u = (scalar(i - row * w) + 0.5) / scalar(w)
     v = (scalar(row) + 0.5) / scalar(h)
-    x = vec3((2 * u - 1) * half, (1 - 2 * v) * half, 0)
+    x = vec3((2 * u - 1) * scene.half, (1 - 2 * v) * scene.half, 0)
     return View(x, dr.normalize(scene.camera - x), hash_bits(i, dr.opaque(uint, seed)))
 
 
