@@ -89,7 +89,7 @@ class Rig:
 
     # --- the screen -----------------------------------------------------------------------------
 
-    @property
+    @cached_property
     def screen_edges(self) -> tuple[Array, Array]:
         """The screen's sides as vectors, along +x and along +y where it is not tilted."""
         turn = Rotation.from_rotvec(self.screen_tilt, degrees=True)
@@ -98,7 +98,7 @@ class Rig:
             turn.apply([0.0, self.screen_size, 0.0]),
         )
 
-    @property
+    @cached_property
     def screen_corner(self) -> Array:
         """The screen's corner at -x, -y: point (s, t) of the screen is corner + s·e_x + t·e_y."""
         centre = np.array(

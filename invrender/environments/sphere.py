@@ -90,7 +90,7 @@ def resample_environment(env: Array, height: int) -> Array:
     )
     columns = _overlaps(np.linspace(0, 1, env.shape[1] + 1), np.linspace(0, 1, 2 * height + 1))
     half = np.tensordot(rows, env.astype(np.float64), (1, 0))
-    return np.einsum("vw,hwc->hvc", columns, half).astype(np.float32)
+    return (columns @ half).astype(np.float32)
 
 
 def _overlaps(old: Array, new: Array) -> Array:
