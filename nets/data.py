@@ -24,14 +24,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save_file
-from scipy.ndimage import gaussian_filter, zoom
+from scipy.ndimage import gaussian_filter
 
 from invrender.backend import Float, dr, vector
 from invrender.environments import (
     find_environments,
     procedural_environment,
     read_environment,
-    resample_environment,
     rotate_environment,
     scale_environment,
 )
@@ -51,6 +50,14 @@ from invrender.render import Material, prepare, radiance
 from invrender.rig import Rig
 from invrender.scene import make_scene, make_view
 from nets.clues import light_inputs, white_level
+from nets.noise import (
+    capture_pattern,
+    captured_environment,
+    display,
+    draw_pattern,
+    fit_gain,
+    sensor,
+)
 from nets.splitsum import area_resize
 
 Array = NDArray[np.floating[Any]]
@@ -203,69 +210,7 @@ def _vec3(v: Array) -> tuple[float, float, float]:
     return float(v[0]), float(v[1]), float(v[2])
 
 
-def draw_pattern(rng: np.random.Generator, pattern: Array) -> Array:
-    """The pattern as a screen shows it whose curve and white balance the ball told us."""
-    if rng.random() < 0.6:
-        return pattern
-    curve = 2.2 ** rng.uniform(-1, 1)
-    return (pattern**curve * np.exp(np.log(1.25) * rng.uniform(-1, 1, 3))).astype(np.float32)
-
-
-def display(rng: np.random.Generator, pattern: Array) -> Array:
-    """What a real screen shows of a pattern: intensity, display curve, white balance."""
-    shown = pattern * np.exp(0.3 * rng.standard_normal())
-    if rng.random() < 0.7:
-        shown = np.clip(shown, 0, None) ** np.exp(0.08 * rng.standard_normal())
-        shown = shown * np.exp(0.06 * rng.standard_normal(3))
-        shown = shown + rng.uniform(0, 0.01) * shown.max()  # black is never black
-    return shown.astype(np.float32)
-
-
-def fit_gain(shown: Array, pattern: Array, rng: np.random.Generator) -> Array:
-    """The RGB gain that a user's software finds for what the screen shows, a little off."""
-    gain = (shown * pattern).sum((0, 1)) / np.maximum((pattern**2).sum((0, 1)), 1e-9)
-    return gain * np.exp(0.01 * rng.standard_normal(3))
-
-
-def capture_pattern(rng: np.random.Generator, shown: Array) -> Array:
-    """What the ball shows of the screen: a mosaic with eroded borders."""
-    n = int(rng.integers(16, 64))
-    small = area_resize(shown, n)
-    if rng.random() < 0.5:
-        border = np.ones((n, n, 1), np.float32)
-        border[0] *= rng.uniform(0, 1)
-        border[-1] *= rng.uniform(0, 1)
-        border[:, 0] *= rng.uniform(0, 1)
-        border[:, -1] *= rng.uniform(0, 1)
-        small = small * border
-    small = small * np.exp(0.02 * rng.standard_normal(small.shape))
-    return np.asarray(zoom(small, (64 / n, 64 / n, 1), order=0, grid_mode=True, mode="nearest"))
-
-
-def captured_environment(rng: np.random.Generator, env: Array, white: float) -> Array:
-    """What the ball shows of the room: coarser, at times clipped, a little off in colour."""
-    height = int(rng.choice([32, 48, 64]))
-    seen = resample_environment(env, height)
-    if rng.random() < 0.3:  # lamps brighter than the photo's white
-        seen = np.minimum(seen, white * np.exp(rng.uniform(np.log(2), np.log(50))))
-    seen = seen * np.exp(0.02 * rng.standard_normal(3)) * np.exp(0.03 * rng.standard_normal())
-    return resample_environment(seen.astype(np.float32), 64)
-
-
 # --- captures -------------------------------------------------------------------------------------
-
-
-def sensor(rng: np.random.Generator, image: Array) -> Array:
-    """A camera's noise, blur and clipping on radiance (H, W, 3)."""
-    if rng.random() < 0.5:
-        image = gaussian_filter(image, (s := rng.uniform(0.2, 0.8), s, 0))
-    top = np.percentile(image, 99.5) * np.exp(rng.uniform(np.log(0.8), np.log(8)))
-    top = max(float(top), 1e-8)
-    electrons = np.exp(rng.uniform(np.log(1500), np.log(60000)))
-    read = np.exp(rng.uniform(np.log(2e-4), np.log(2e-3)))
-    x = np.clip(image / top, 0, None)
-    x = x + np.sqrt(x / electrons + read**2) * rng.standard_normal(image.shape)
-    return (np.clip(x, 0, 1) * top).astype(np.float32)
 
 
 def make_group(rng: np.random.Generator, options: Options) -> list[Sample]:
