@@ -1,0 +1,54 @@
+"""What every exporter is given, and normals as files hold them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from invrender.export.textures import Texture
+from invrender.maps import Maps
+
+Array = NDArray[np.floating[Any]]
+
+
+@dataclass(frozen=True)
+class Material:
+    """A named sample: its maps, its width in metres and, if wanted, its height (H, W) in metres."""
+
+    name: str
+    maps: Maps
+    width: float
+    height: Array | None = None
+
+    @property
+    def sides(self) -> tuple[float, float]:
+        """Width and height of the sample in metres; pixels are square."""
+        rows, columns = self.maps.shape
+        return self.width, self.width * rows / columns
+
+
+def normal_texture(normal: Array, convention: str) -> Texture:
+    """n/2 + 1/2; "directx" has the green channel point down."""
+    sign = np.array([1, -1 if convention == "directx" else 1, 1], np.float32)
+    return Texture(normal * sign / 2 + 0.5)
+
+
+def normals_seen(image: Array, convention: str) -> Array:
+    """Unit normals from what `normal_texture` wrote."""
+    sign = np.array([1, -1 if convention == "directx" else 1, 1], np.float32)
+    n = (image[..., :3] * 2 - 1) * sign
+    return (n / np.linalg.norm(n, axis=-1, keepdims=True)).astype(np.float32)
+
+
+def height_texture(height: Array) -> Texture:
+    """Heights mapped to [0, 1], the lowest to 0; `height_range` undoes it."""
+    low, high = height_range(height)
+    return Texture((height - low) / max(high - low, 1e-12))
+
+
+def height_range(height: Array) -> tuple[float, float]:
+    """Metres of black and white in a height texture."""
+    return float(height.min()), float(height.max())

@@ -1,0 +1,132 @@
+"""MaterialX (.mtlx) with its textures, written and validated by the MaterialX library.
+
+Two materials share the textures. NAME is our BRDF in MaterialX's own closures: a Lambertian plus a
+generalised Schlick lobe with F0 = k_s, F90 = 1 and GGX of α = ρ². NAME_standard_surface is for
+renderers that know only Autodesk's Standard Surface; it is metal-rough.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from invrender.errors import InputError
+from invrender.export.material import (
+    Material,
+    height_range,
+    height_texture,
+    normal_texture,
+    normals_seen,
+)
+from invrender.export.metalrough import MetalRough, maps_of, metal_rough
+from invrender.export.textures import SUFFIXES, Texture, safe_name, whole_folder, write_textures
+from invrender.maps import Maps
+
+
+def write_materialx(
+    material: Material, out: Path, format: str, convention: str
+) -> dict[str, Maps]:
+    """Write ``NAME.mtlx`` and its textures; raises `InputError` without the materialx package."""
+    try:
+        import MaterialX as mx
+    except ImportError:
+        raise InputError(
+            "MaterialX files need the materialx package: pip install 'invrender[export]'"
+        ) from None
+    maps, name = material.maps, safe_name(material.name)
+    mr = metal_rough(maps)
+    textures = {
+        f"{name}_diffuse": Texture(maps.diffuse, colour=True),
+        f"{name}_specular": Texture(maps.specular, colour=True),
+        f"{name}_roughness": Texture(maps.roughness),
+        f"{name}_normal": normal_texture(maps.normal, convention),
+        f"{name}_base": Texture(mr.base, colour=True),
+        f"{name}_metalness": Texture(mr.metallic),
+    }
+    if material.height is not None:
+        textures[f"{name}_height"] = height_texture(material.height)
+    with whole_folder(out) as folder:
+        document = _document(mx, material, name, format)
+        valid, message = document.validate()
+        if not valid:
+            raise RuntimeError(f"the MaterialX document is not valid: {message}")
+        mx.writeToXmlFile(document, str(folder / f"{name}.mtlx"), _own_elements(mx))
+        seen = write_textures(folder, textures, format)
+    diffuse, specular, rough, normal, base, metal = (seen[k] for k in list(textures)[:6])
+    n = normals_seen(normal, convention)
+    return {
+        name: Maps(diffuse, specular, rough, n),
+        f"{name}_standard_surface": maps_of(MetalRough(base, metal, mr.f0), rough, n),
+    }
+
+
+def _own_elements(mx: Any) -> Any:
+    """Leave the standard library, which every reader has, out of the file."""
+    options = mx.XmlWriteOptions()
+    options.elementPredicate = lambda element: not element.hasSourceUri()
+    return options
+
+
+def _document(mx: Any, material: Material, name: str, format: str) -> Any:
+    document = mx.createDocument()
+    library = mx.createDocument()
+    mx.loadLibraries(mx.getDefaultDataLibraryFolders(), mx.getDefaultDataSearchPath(), library)
+    document.setDataLibrary(library)
+    document.setColorSpace("lin_rec709")
+    graph = document.addNodeGraph(f"NG_{name}")
+    colour_space = "lin_rec709" if format == "exr" else "srgb_texture"
+
+    def image(key: str, kind: str, colour: bool = False) -> Any:
+        node = graph.addNode("image", f"image_{key}", kind)
+        file = node.setInputValue("file", f"{name}_{key}{SUFFIXES[format]}", "filename")
+        if colour:
+            file.setColorSpace(colour_space)
+        return node
+
+    def output(key: str, node: Any, kind: str) -> None:
+        graph.addOutput(f"out_{key}", kind).setConnectedNode(node)
+
+    for key in ("diffuse", "specular", "base"):
+        output(key, image(key, "color3", colour=True), "color3")
+    for key in ("roughness", "metalness"):
+        output(key, image(key, "float"), "float")
+    normal = graph.addNode("normalmap", "normalmap", "vector3")
+    normal.setConnectedNode("in", image("normal", "vector3"))
+    output("normal", normal, "vector3")
+
+    def connect(node: Any, **sources: str) -> Any:
+        for key, source in sources.items():
+            kind = graph.getOutput(f"out_{source}").getType()
+            node.addInput(key, kind).setConnectedOutput(graph.getOutput(f"out_{source}"))
+        return node
+
+    displacement = None
+    if material.height is not None:
+        output("height", image("height", "float"), "float")
+        low, high = height_range(material.height)
+        displacement = document.addNode("displacement", f"{name}_relief", "displacementshader")
+        connect(displacement, displacement="height")
+        displacement.setInputValue("scale", max(high - low, 1e-12), "float")
+
+    alpha = graph.addNode("roughness_anisotropy", "alpha", "vector2")
+    alpha.setConnectedNode("roughness", graph.getNode("image_roughness"))
+    output("alpha", alpha, "vector2")
+    lambert = document.addNode("oren_nayar_diffuse_bsdf", f"{name}_lambert", "BSDF")
+    connect(lambert, color="diffuse", normal="normal")
+    lobe = document.addNode("generalized_schlick_bsdf", f"{name}_lobe", "BSDF")
+    connect(lobe, color0="specular", roughness="alpha", normal="normal")
+    both = document.addNode("add", f"{name}_bsdf", "BSDF")
+    both.setConnectedNode("in1", lambert)
+    both.setConnectedNode("in2", lobe)
+    surface = document.addNode("surface", f"{name}_surface", "surfaceshader")
+    surface.setConnectedNode("bsdf", both)
+
+    standard = document.addNode("standard_surface", f"{name}_standard", "surfaceshader")
+    connect(standard, base_color="base", metalness="metalness", specular_roughness="roughness",
+            normal="normal")  # fmt: skip
+    standard.setInputValue("base", 1.0, "float")
+    for key, shader in ((name, surface), (f"{name}_standard_surface", standard)):
+        node = document.addMaterialNode(key, shader)
+        if displacement is not None:
+            node.setConnectedNode("displacementshader", displacement)
+    return document
