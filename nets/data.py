@@ -58,6 +58,7 @@ from nets.noise import (
     fit_gain,
     sensor,
 )
+from nets.sheet import problems
 from nets.splitsum import area_resize
 
 Array = NDArray[np.floating[Any]]
@@ -243,8 +244,10 @@ def make_group(rng: np.random.Generator, options: Options) -> list[Sample]:
         dr.eval(parts)
         a, b, c = (np.asarray(p).T.reshape(size, size, 3) for p in parts)
         sample = {"photo": sensor(rng, a + b), "ideal": a + c, **lights}
-        if all(np.isfinite(v).all() for v in sample.values()) and sample["photo"].max() > 0:
-            out.append(_pack(sample, unit, maps))
+        if all(np.isfinite(v).all() for v in sample.values()):
+            packed = _pack(sample, unit, maps)
+            if not problems(packed):
+                out.append(packed)
     return out
 
 

@@ -7,16 +7,17 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from safetensors.numpy import load_file  # noqa: E402
+from safetensors.numpy import load_file, save_file  # noqa: E402
 
 from invrender.errors import InputError  # noqa: E402
 from invrender.images import write_exr  # noqa: E402
 from invrender.maps import constant_maps, write_maps  # noqa: E402
 from invrender.pattern import block_pattern  # noqa: E402
-from nets import data, train  # noqa: E402
+from nets import data, sheet, train  # noqa: E402
 from nets.loader import batches, positions, read_batch, shards  # noqa: E402
 from nets.loss import MAPS, SPREAD, compare, total_loss, truth  # noqa: E402
 from nets.model import build, load_weights  # noqa: E402
+from nets.sheet import problems  # noqa: E402
 
 OPTIONS = data.Options(size=16, samples=8, seed=3)
 torch.set_num_threads(1)  # small tensors: more only get in each other's way
@@ -105,6 +106,41 @@ def test_display_and_sensor_noise_are_small_and_seeded():
     np.testing.assert_array_equal(a, b)
     assert abs(a.mean() / 0.4 - 1) < 0.25 and a.std() < 0.1
     assert data.capture_pattern(rng, shown).shape == (64, 64, 3)
+
+
+def test_degenerate_captures_are_named(folder):
+    good = {k: v[0] for k, v in load_file(shards(folder)[0]).items()}
+    assert problems(good) == []
+    photo = good["photo"]
+    cases = {
+        "black": photo * 0,
+        "clipped": np.minimum(photo, np.percentile(photo, 5)).astype(np.float16),
+        "not finite": np.where(photo == photo.max(), np.nan, photo),
+    }
+    for word, bad in cases.items():
+        (found,) = problems({**good, "photo": bad})
+        assert word in found
+    # Half of it at the sensor's limit is still of use.
+    middle = np.percentile(photo.max(0), 60)
+    assert problems({**good, "photo": np.minimum(photo, middle).astype(np.float16)}) == []
+
+
+def test_sheet_reports_and_draws(folder, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "sheet.png"
+    monkeypatch.setattr("sys.argv", ["s", "--data", str(folder), "--out", str(out), "--count", "2"])
+    assert sheet.main() == 0 and out.stat().st_size > 1000
+    assert "12 captures, 0 of them degenerate" in capsys.readouterr().out
+    shard = load_file(shards(folder)[0])
+    shard["photo"] = np.zeros_like(shard["photo"])
+    (tmp_path / "bad").mkdir()
+    save_file(shard, tmp_path / "bad" / "shard_000000.safetensors")
+    monkeypatch.setattr(
+        "sys.argv", ["s", "--data", str(tmp_path / "bad"), "--out", str(out), "--count", "1"]
+    )
+    assert sheet.main() == 1
+    assert "shard_000000[5]: the photo is black" in capsys.readouterr().out
+    monkeypatch.setattr("sys.argv", ["s", "--data", str(tmp_path), "--out", str(out)])
+    assert sheet.main() == 2
 
 
 # --- loading --------------------------------------------------------------------------------------
