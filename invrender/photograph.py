@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from invrender import brdf
 from invrender.backend import BACKEND, dr
+from invrender.environments import mitsuba_rows
 from invrender.maps import Maps
 from invrender.rig import Rig
 
@@ -209,17 +210,9 @@ def _lights(
             },
         }
     if environment is not None:
-        # Mitsuba places row i of R at θ = π i/(R - 1). With 2H + 1 rows its bilinear interpolation
-        # has a knot at each of our texel centres: the same function.
-        h = environment.shape[0]
-        v = np.clip(np.arange(2 * h + 1) / 2 - 0.5, 0, h - 1)
-        low = np.minimum(v.astype(int), max(h - 2, 0))
-        f = (v - low)[:, None, None]
-        rows = environment[low] * (1 - f) + environment[np.minimum(low + 1, h - 1)] * f
-        # Its azimuth runs the other way round a y-up axis.
         lights["environment"] = {
             "type": "envmap",
-            "bitmap": _bitmap(rows[:, ::-1]),
+            "bitmap": _bitmap(mitsuba_rows(environment)),
             "to_world": _transform(
                 [np.array(c, float) for c in ([0, -1, 0], [0, 0, 1], [-1, 0, 0], [0, 0, 0])]
             ),

@@ -12,6 +12,7 @@ from invrender.environments.procedural import KINDS, procedural_environment
 from invrender.environments.sphere import (
     directions,
     irradiance,
+    mitsuba_rows,
     resample_environment,
     rotate_environment,
     scale_environment,
@@ -24,6 +25,7 @@ __all__ = [
     "directions",
     "find_environments",
     "irradiance",
+    "mitsuba_rows",
     "procedural_environment",
     "read_environment",
     "resample_environment",

@@ -93,6 +93,20 @@ def resample_environment(env: Array, height: int) -> Array:
     return (columns @ half).astype(np.float32)
 
 
+def mitsuba_rows(env: Array) -> Array:
+    """The same bilinear function as Mitsuba's envmap interpolates it, (2·H + 1, W, 3).
+
+    It places row i of R at θ = π·i/(R - 1): with 2·H + 1 rows it has a knot at each of our texel
+    centres. Its azimuth runs the other way round a y-up axis.
+    """
+    h = env.shape[0]
+    v = np.clip(np.arange(2 * h + 1) / 2 - 0.5, 0, h - 1)
+    low = np.minimum(v.astype(int), max(h - 2, 0))
+    f = (v - low)[:, None, None]
+    rows = env[low] * (1 - f) + env[np.minimum(low + 1, h - 1)] * f
+    return np.ascontiguousarray(rows[:, ::-1], np.float32)
+
+
 def _overlaps(old: Array, new: Array) -> Array:
     """Weights (n_new, n_old) of the mean over new intervals of a function constant on the old."""
     sign = 1 if old[-1] > old[0] else -1

@@ -20,7 +20,9 @@ from invrender.export.textures import Texture, safe_name, whole_folder, write_te
 from invrender.maps import Maps
 
 Array = NDArray[np.floating[Any]]
-WHITE_F0 = 0.08  # reflectance of "specular" = 1 in Unreal and of "specular IOR level" = 1 in Blender
+WHITE_F0 = (
+    0.08  # reflectance of "specular" = 1 in Unreal and of "specular IOR level" = 1 in Blender
+)
 
 
 def write_blender(material: Material, out: Path, format: str, convention: str) -> dict[str, Maps]:

@@ -16,12 +16,14 @@ Array = NDArray[np.floating[Any]]
 
 @dataclass(frozen=True)
 class Material:
-    """A named sample: its maps, its width in metres and, if wanted, its height (H, W) in metres."""
+    """A named sample: its maps, its width in metres and, where known or wanted, its height (H, W)
+    in metres and the environment it was captured in."""
 
     name: str
     maps: Maps
     width: float
     height: Array | None = None
+    environment: Array | None = None
 
     @property
     def sides(self) -> tuple[float, float]:

@@ -23,9 +23,7 @@ from invrender.export.textures import SUFFIXES, Texture, safe_name, whole_folder
 from invrender.maps import Maps
 
 
-def write_materialx(
-    material: Material, out: Path, format: str, convention: str
-) -> dict[str, Maps]:
+def write_materialx(material: Material, out: Path, format: str, convention: str) -> dict[str, Maps]:
     """Write ``NAME.mtlx`` and its textures; raises `InputError` without the materialx package."""
     try:
         import MaterialX as mx
