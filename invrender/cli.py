@@ -1,26 +1,34 @@
-"""The command line: ``invrender refine``, ``simulate`` and ``pattern``."""
+"""The command line; its sub-commands are in the modules whose names end in ``_cli``.
+
+Results and JSON go to standard output, everything else to standard error, in colour on terminals
+only. Exit codes: 0 done; 1 some of several captures failed, or ``doctor`` found a fault; 2 bad
+input; 130 interrupted.
+"""
 
 from __future__ import annotations
 
 import argparse
 import json
+import logging
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
+from rich.logging import RichHandler
 
-from invrender import pattern_cli
+from invrender import export_cli, pattern_cli
 from invrender.errors import InputError
 
 EXAMPLE = Path(__file__).parent / "data" / "example"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; returns the exit code: 0 done, 2 bad input, 130 interrupted."""
+    """Run a command; returns the exit code, see the module."""
     parser = _parser()
     args = parser.parse_args(argv)
-    console = Console(stderr=True, quiet=getattr(args, "quiet", False))
+    console = Console(stderr=True, quiet=args.quiet)
+    _log(args.verbose)
     try:
         return int(args.run(args, console))
     except InputError as error:
@@ -67,7 +75,6 @@ def _parser() -> argparse.ArgumentParser:
         metavar="X,Y,R",
         help="the ball's centre and radius in photo pixels, if it is not found by itself",
     )
-    refine.add_argument("--quiet", action="store_true", help="print nothing but errors")
     refine.add_argument("--json", action="store_true", help="print the report as JSON")
     refine.set_defaults(run=_refine)
 
@@ -92,7 +99,19 @@ def _parser() -> argparse.ArgumentParser:
     simulate.set_defaults(run=_simulate)
 
     pattern_cli.add_parser(commands)
+    export_cli.add_parser(commands)
+    for command in commands.choices.values():
+        loudness = command.add_mutually_exclusive_group()
+        loudness.add_argument("-q", "--quiet", action="store_true", help="print only errors")
+        loudness.add_argument("-v", "--verbose", action="store_true", help="tell every step")
     return parser
+
+
+def _log(verbose: bool) -> None:
+    """Warnings of the log "invrender", or all of it, to standard error."""
+    log = logging.getLogger("invrender")
+    log.handlers[:] = [RichHandler(console=Console(stderr=True), show_path=False, show_time=False)]
+    log.setLevel(logging.INFO if verbose else logging.WARNING)
 
 
 def _ball(text: str) -> tuple[float, float, float]:

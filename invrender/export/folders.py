@@ -26,7 +26,8 @@ WHITE_F0 = (
 
 
 def write_blender(material: Material, out: Path, format: str, convention: str) -> dict[str, Maps]:
-    """``NAME_BaseColor NAME_Metallic NAME_Specular NAME_Roughness NAME_Normal [NAME_Displacement]``.
+    """Write ``NAME_BaseColor``, ``_Metallic``, ``_Specular``, ``_Roughness``, ``_Normal`` and, with
+    a height, ``_Displacement``.
 
     In Blender: select the Principled BSDF, Ctrl+Shift+T, and choose all files.
     """
@@ -49,8 +50,8 @@ def write_blender(material: Material, out: Path, format: str, convention: str) -
 
 
 def write_unreal(material: Material, out: Path, format: str, convention: str) -> dict[str, Maps]:
-    """``T_NAME_BC T_NAME_ORM T_NAME_S T_NAME_N [T_NAME_H]``: base colour (sRGB); ambient occlusion,
-    roughness and metalness in R, G and B; specular; normal."""
+    """Write ``T_NAME_BC T_NAME_ORM T_NAME_S T_NAME_N [T_NAME_H]``: base colour (sRGB); ambient
+    occlusion, roughness and metalness in R, G and B; specular; normal."""
     maps, name = material.maps, safe_name(material.name)
     mr = with_grey_f0(maps, WHITE_F0)
     orm = np.stack([np.ones_like(maps.roughness), maps.roughness, mr.metallic], -1)
@@ -74,9 +75,9 @@ def write_unreal(material: Material, out: Path, format: str, convention: str) ->
 
 
 def write_unity(material: Material, out: Path, format: str, convention: str) -> dict[str, Maps]:
-    """``NAME_Albedo NAME_SpecularSmoothness NAME_Normal [NAME_Height]`` for the specular workflow:
-    k_d (sRGB); k_s (sRGB) with smoothness in its alpha; normal. Unity multiplies the albedo by
-    1 - max(k_s), so it is divided by that here."""
+    """Write ``NAME_Albedo NAME_SpecularSmoothness NAME_Normal [NAME_Height]`` for the specular
+    workflow: k_d (sRGB); k_s (sRGB) with smoothness in its alpha; normal. Unity multiplies the
+    albedo by 1 - max(k_s), so it is divided by that here."""
     if format == "jpeg":
         raise InputError("Unity keeps smoothness in an alpha channel, which JPEG has not; use png8")
     maps, name = material.maps, safe_name(material.name)

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import json
 import struct
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
-from importlib.metadata import version
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,14 +69,15 @@ def _split(maps: Maps, format: str) -> MetalRough:
         return encoded(texture, format)[1]
 
     m = rounded(_rough_metal(maps.roughness, metal_rough(maps).metallic))[..., 2]
-    for m in (m, np.zeros_like(m)):
-        mr = with_coloured_f0(maps, m)
+    for metal in (m, np.zeros_like(m)):
+        mr = with_coloured_f0(maps, metal)
         base = rounded(Texture(mr.base, colour=True))
-        error = mr.base * (1 - m[..., None]) - maps.diffuse
+        error = mr.base * (1 - metal[..., None]) - maps.diffuse
         if np.sqrt(np.mean(error**2)) <= WORST_DIFFUSE:
             break
-    f0 = (maps.specular - m[..., None] * base) / np.maximum(1 - m[..., None], 1e-6)
-    return MetalRough(mr.base, m, np.clip(f0, 0, 1))
+    n = metal[..., None]
+    f0 = (maps.specular - n * base) / np.maximum(1 - n, 1e-6)
+    return MetalRough(mr.base, metal, np.clip(f0, 0, 1))
 
 
 def _rough_metal(roughness: Array, metallic: Array) -> Texture:

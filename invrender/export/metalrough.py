@@ -2,7 +2,7 @@
 
     k_d = base·(1 - metallic),    k_s = f0·(1 - metallic) + base·metallic,
 
-where f0, the reflectance of the part that is no metal, is 0.04 unless a renderer takes it per pixel.
+where f0, the reflectance of the part that is no metal, is 0.04 unless a renderer takes it as a map.
 Six numbers a pixel become four, so the conversion has an error, which the exporters report.
 """
 

@@ -109,7 +109,7 @@ def whole_folder(out: Path) -> Iterator[Path]:
 
 
 def safe_name(text: str) -> str:
-    """A name for files and materials, of letters, digits, - and _ only: it cannot leave a folder."""
+    """A name for files and materials of letters, digits, - and _: it cannot leave a folder."""
     return re.sub(r"[^A-Za-z0-9_-]+", "_", text).strip("_")[:64] or "material"
 
 

@@ -1,0 +1,104 @@
+"""``invrender export``: a result in the form that another program reads."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+
+if TYPE_CHECKING:
+    from invrender.export import Exported
+
+TARGETS = ("gltf", "materialx", "blender", "unreal", "unity", "mitsuba")
+
+
+def add_parser(commands: Any) -> None:
+    """Add the sub-command to argparse's sub-parsers."""
+    parser = commands.add_parser(
+        "export",
+        help="write a result for glTF, MaterialX, Blender, Unreal, Unity or Mitsuba",
+        description="Write a result's maps in the form that another program reads, and say what "
+        "the conversion costs: the error of the maps, and of their re-rendering, as a reader of "
+        "the files sees them.",
+    )
+    parser.add_argument(
+        "result", type=Path, help="a folder that refine wrote, or any folder of material maps"
+    )
+    parser.add_argument("--to", required=True, choices=TARGETS, help="what to write")
+    parser.add_argument(
+        "-o", "--out", type=Path, required=True, help="a .glb file for gltf, a folder for the rest"
+    )
+    parser.add_argument(
+        "--format",
+        choices=("png8", "png16", "exr", "jpeg"),
+        help="of the textures; gltf: png8 (default) or jpeg; materialx, mitsuba: exr; blender: "
+        "png16; unreal, unity: png8",
+    )
+    parser.add_argument(
+        "--normal-convention",
+        choices=("opengl", "directx"),
+        help="whether green points up or down in normal maps (unreal: directx, else opengl)",
+    )
+    parser.add_argument("--tileable", action="store_true", help="make the maps seamless")
+    parser.add_argument(
+        "--height", action="store_true", help="add a height map, integrated from the normals"
+    )
+    parser.add_argument("--name", help="of the material and its files (the capture's)")
+    parser.add_argument(
+        "--width", type=float, metavar="METRES", help="of the sample (what the result says)"
+    )
+    parser.add_argument("--json", action="store_true", help="print what was written as JSON")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace, console: Console) -> int:
+    """Run the sub-command."""
+    from invrender.export import export
+
+    with console.status(f"exporting to {args.to} …"):
+        done = export(
+            args.result,
+            args.out,
+            args.to,
+            format=args.format,
+            normal_convention=args.normal_convention,
+            name=args.name,
+            width=args.width,
+            tileable=args.tileable,
+            height=args.height,
+        )
+    if args.json:
+        print(json.dumps(asdict(done)))
+    else:
+        _print(done, console)
+    return 0
+
+
+def _print(done: Exported, console: Console) -> None:
+    lines = [
+        f"wrote {done.path}: {done.name}, {done.width * 100:.3g} cm wide, {done.format}, "
+        f"{done.normal_convention} normals"
+    ]
+    for reader, errors in done.errors.items():
+        lines.append(
+            f"  {reader}: re-render error {errors['rerender']:.2%}, maps {errors['average']:.4f} "
+            f"(diffuse {errors['diffuse']:.4f}, specular {errors['specular']:.4f})"
+        )
+    if done.seams:
+        lines.append(
+            "  seams, in steps between neighbours: at the border "
+            f"{done.seams['before']:.2g} → {done.seams['after']:.2g}, along the cuts "
+            f"{done.seams['cuts']:.2g}; {done.seams['replaced']:.0%} of the pixels replaced"
+        )
+    if done.height:
+        lines.append(
+            f"  height: black {done.height['black'] * 1000:.4g} mm, white "
+            f"{done.height['white'] * 1000:.4g} mm; no surface explains "
+            f"{done.height['outliers']:.1%} of the slopes"
+        )
+    for line in lines:
+        console.print(line, markup=False, highlight=False)
