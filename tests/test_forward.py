@@ -103,6 +103,8 @@ def test_dark_scenes(estimator):
     with_screen = render.render(Rig(), maps, black, env, estimator=estimator, samples=256)
     without = render.render(Rig(), maps, None, env, estimator=estimator, samples=256)
     assert with_screen.mean() < 0.8 * without.mean()
+    unlit = render.render(Rig(), maps, 1 - black, env, 0.0, estimator=estimator, samples=256)
+    assert np.array_equal(with_screen, unlit)
     black_maps = constant_maps(8, 8, 0.0, 0.0, 1.0)
     only_schlick = render.render(Rig(), black_maps, None, env, estimator=estimator, samples=256)
     assert 0 < only_schlick.mean() < 0.02
@@ -227,6 +229,22 @@ def test_fast_is_exact_without_lamps():
     rms = [np.sqrt(np.mean((run("fast", s, 1) - reference) ** 2)) for s in (16, 64, 256, 4096)]
     rms = np.array(rms) / reference.mean()
     assert np.all(np.diff(rms) < 0) and rms[1] < 0.015 and rms[3] < 0.002, rms
+
+
+@pytest.mark.slow  # seconds and gigabytes
+def test_detail_lowers_the_error_of_the_tables():
+    """Irradiance has no samples: its error is the tables', and falls with their size."""
+    n = 24
+    scene = make_scene(Rig(), some_pattern(64), some_environment(32, 0, 0, 0), GAIN)
+    m, view = material_from_maps(some_maps(n, "rough")), make_view(scene, n, n)
+
+    def irradiance(detail):
+        prepared = render.prepare(scene, "fast", detail)
+        return np.array(render.shade(prepared, view, m.roughness, m.normal, 1).irradiance)
+
+    finest = irradiance(4)
+    errors = [np.sqrt(np.mean((irradiance(k) - finest) ** 2)) / finest.mean() for k in (1, 2)]
+    assert errors[0] < 1e-3 and errors[1] < 0.5 * errors[0], errors
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)

@@ -24,7 +24,6 @@ Array = NDArray[np.floating[Any]]
 
 CELLS = 16  # of the pattern a side, bilinear between: about what the ball's image resolves
 GROUP = 8  # pixels that share a material
-UNLIT = 1e-6  # radiance of a screen that only hides what is behind it
 ROOM_HEIGHT = 64  # rows of the environments
 
 
@@ -125,7 +124,7 @@ def measure_responses(
 
     white = _screen_irradiance(screen, population)
     room = np.zeros((m, 4, 3, 3), np.float32)
-    black = np.full((cells, cells, 3), UNLIT)
+    black = np.zeros((cells, cells, 3))  # it still hides what is behind it
     group = np.repeat(np.arange(len(population.env_index)), GROUP)
     for index in np.unique(population.env_index):
         env = scale_environment(procedural_environment(int(index), ROOM_HEIGHT), 1.0)
