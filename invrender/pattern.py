@@ -1,6 +1,6 @@
 """The light pattern that the screen shows.
 
-The default is the outcome of `invrender.pattern_design`: docs/pattern.md tells how.
+The default is the outcome of `python -m invrender.design`: docs/pattern.md tells how.
 """
 
 from __future__ import annotations

@@ -170,6 +170,14 @@ def test_population_is_seeded_and_in_range():
     assert np.abs(small.x).max() <= 0.025
 
 
+@pytest.mark.slow
+def test_shipped_pattern_scores_what_the_docs_say():
+    held_out = Criterion(measure_responses(RIG, draw_population(RIG, 320, 3)))
+    score = lambda p: held_out.errors(resize_pattern(p, 16))["criterion"]  # noqa: E731
+    assert score(default_pattern()) == pytest.approx(0.380, abs=0.002)
+    assert score(np.ones((16, 16, 3))) == pytest.approx(0.610, abs=0.002)
+
+
 # --- the command --------------------------------------------------------------------------------
 
 
