@@ -17,7 +17,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.logging import RichHandler
 
-from invrender import export_cli, pattern_cli
+from invrender import compare_cli, export_cli, pattern_cli
 from invrender.errors import InputError
 
 EXAMPLE = Path(__file__).parent / "data" / "example"
@@ -99,6 +99,7 @@ def _parser() -> argparse.ArgumentParser:
     simulate.set_defaults(run=_simulate)
 
     pattern_cli.add_parser(commands)
+    compare_cli.add_parser(commands)
     export_cli.add_parser(commands)
     for command in commands.choices.values():
         loudness = command.add_mutually_exclusive_group()
