@@ -1,0 +1,112 @@
+"""One way to map a function over many items: in this process, in a few, or on a Dask cluster.
+
+The function must be importable, and safe to run again on the same item: a worker that dies takes
+the results with it that nobody has fetched yet, and its items are run again elsewhere. Every item
+is reported exactly once.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from typing import Any
+
+from invrender.errors import InputError
+
+RETRIES = 10  # workers that may die over one item
+TASKS_PER_PROCESS = 16  # then it is replaced: Dr.Jit's caches grow with the kernels
+
+
+@dataclass(frozen=True)
+class Done:
+    """An item's index, and the function's result or the error it raised."""
+
+    index: int
+    result: Any = None
+    error: Exception | None = None
+    trace: str = ""
+
+    def unwrap(self) -> Any:
+        """The result; raises the error if there was one."""
+        if self.error is not None:
+            raise self.error
+        return self.result
+
+
+def map_tasks(
+    function: Callable[[Any], Any],
+    items: Sequence[Any],
+    scheduler: str | None = None,
+    workers: int = 1,
+    initializer: Callable[[], None] | None = None,
+) -> Iterator[Done]:
+    """Apply a function to every item; yields each item's `Done` as it comes, in any order.
+
+    scheduler: the address of a Dask scheduler; needs the extra ``cluster``. Without one, a number
+    of ``workers`` other than 1 means that many processes, each started with ``initializer``. An
+    error of one item does not stop the others. Raises `InputError` if no scheduler answers.
+    """
+    if scheduler:
+        yield from _on_cluster(function, items, scheduler)
+    elif workers == 1:
+        for index, item in enumerate(items):
+            yield _guarded(function, index, item)
+    else:
+        yield from _in_processes(function, items, workers, initializer)
+
+
+def _guarded(function: Callable[[Any], Any], index: int, item: Any) -> Done:
+    try:
+        return Done(index, function(item))
+    except Exception as error:  # reported with its item; the others go on
+        return Done(index, error=error, trace=traceback.format_exc())
+
+
+def _in_processes(
+    function: Callable[[Any], Any],
+    items: Sequence[Any],
+    workers: int,
+    initializer: Callable[[], None] | None,
+) -> Iterator[Done]:
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(
+        workers, context, initializer, max_tasks_per_child=TASKS_PER_PROCESS
+    ) as pool:
+        jobs = [pool.submit(_guarded, function, i, item) for i, item in enumerate(items)]
+        try:
+            for job in as_completed(jobs):
+                yield job.result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _on_cluster(
+    function: Callable[[Any], Any], items: Sequence[Any], scheduler: str
+) -> Iterator[Done]:
+    try:
+        import distributed
+    except ImportError:
+        raise InputError("a cluster needs Dask: pip install 'invrender[cluster]'") from None
+    try:
+        client = distributed.Client(scheduler, timeout=10)
+    except (OSError, ValueError, TimeoutError):
+        raise InputError(f"no Dask scheduler answers at {scheduler}") from None
+    with client:
+        version = client.run_on_scheduler(lambda: distributed.__version__)
+        if version != distributed.__version__:
+            raise InputError(f"the cluster runs Dask {version}, this is {distributed.__version__}")
+        jobs = [
+            client.submit(_guarded, function, i, item, pure=False, retries=RETRIES)
+            for i, item in enumerate(items)
+        ]
+        numbers = {job.key: i for i, job in enumerate(jobs)}
+        # Results are fetched as they come, so that a dying worker takes few with it.
+        for job, done in distributed.as_completed(jobs, with_results=True, raise_errors=False):
+            if job.status == "finished":
+                yield done
+            else:  # its workers died too often
+                error = job.exception()
+                yield Done(numbers[job.key], error=RuntimeError(f"{type(error).__name__}: {error}"))
