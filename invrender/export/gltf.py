@@ -92,9 +92,9 @@ def _write_glb(
     geometry: list[tuple[str, bytes, dict[str, Any]]] = [
         ("POSITION", corners.tobytes(), {"type": "VEC3", "componentType": FLOAT, "count": 4,
          "min": corners.min(0).tolist(), "max": corners.max(0).tolist()}),
-        ("NORMAL", np.tile(np.float32([0, 0, 1]), 4).astype("<f4").tobytes(),
+        ("NORMAL", np.tile(np.array([0, 0, 1], "<f4"), 4).tobytes(),
          {"type": "VEC3", "componentType": FLOAT, "count": 4}),
-        ("TANGENT", np.tile(np.float32([1, 0, 0, 1]), 4).astype("<f4").tobytes(),
+        ("TANGENT", np.tile(np.array([1, 0, 0, 1], "<f4"), 4).tobytes(),
          {"type": "VEC4", "componentType": FLOAT, "count": 4}),
         # Row 0 of an image is at v = 0.
         ("TEXCOORD_0", np.array([0, 1, 1, 1, 1, 0, 0, 0], "<f4").tobytes(),
