@@ -1,8 +1,8 @@
-"""Simulated photographs of the whole rig in about a second each, with everything a hand does wrong.
+"""Simulated photographs of the whole rig in seconds each, with everything a hand does wrong.
 
-Rays are cast in numpy against the table, the sample, the mirror hemisphere, the screen and the room;
-only the sample's own shading comes from the package's forward model. The mirror is traced here
-on its own, so that an error in the package's unfolding shows.
+Rays are cast in numpy against table, sample, mirror hemisphere, screen and room; only the sample's
+own shading comes from the package's forward model. The mirror is traced here on its own, so that
+an error in the package's unfolding shows.
 """
 
 from __future__ import annotations
@@ -284,7 +284,10 @@ def make_shot(
     ball: bool = True, display: bool = True, exposure: float = 1.0, width: int = 1280,
     rooms: Path | None = None,
 ) -> Shot:  # fmt: skip
-    """One photograph; the same seed gives the same one. exposure: of a JPEG, 1 just fits the screen."""
+    """One photograph; the same seed gives the same one.
+
+    exposure: of a JPEG; at 1 the screen just fits.
+    """
     rng = np.random.default_rng(50_000 + seed)
     nominal = Rig(fov=float(rng.uniform(73.7, 80)))
     rig = hand_held(rng, nominal, camera, screen)
@@ -321,7 +324,9 @@ def make_shot(
         rig, centre, size, albedo * wide / np.pi, sample, environment, screen_light,
         samples=4 if width < 2500 else 2,
     )  # fmt: skip
-    if ball and hard and rng.uniform() < 0.25:  # glare: a veil over one side of the ball
+    if (
+        centre is not None and hard and rng.uniform() < 0.25
+    ):  # glare: a veil over one side of the ball
         x, y = rig.project(centre, *size)
         r = rig.focal(width) * rig.ball_radius / rig.camera[2]
         a = rng.uniform(0, 2 * np.pi)

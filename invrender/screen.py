@@ -1,10 +1,9 @@
 """Where the screen hangs and what it shows, read from its image in the mirror ball.
 
 The known pattern is registered with the ball's image: the screen's shift and tilt, the display's
-curve (a gamma a channel), its gain and the camera's blur are fitted together, by damped Gauss–Newton
-from coarse to fine. Each pixel is compared with what it should average of the pattern; pixels on the
-screen's edge with a share of the room beside it, which makes them the less certain the more of the
-room they hold.
+curve (a gamma a channel), its gain and the camera's blur are fitted together, by damped
+Gauss–Newton from coarse to fine. Each pixel is compared with what it should average of the pattern.
+Pixels on the screen's edge hold a share of the room beside it; the more, the less certain they are.
 """
 
 from __future__ import annotations
@@ -37,11 +36,11 @@ EDGE = 3  # pixels outside the screen's image that are compared as well
 class Screen:
     """The screen as the ball shows it.
 
-    ``rig``: with the screen's shift and tilt; ``shown`` (h, w, 3): the pattern through the display's
-    curve, ``gamma`` (3,); its radiance is ``gain`` (3,) times that. ``blur`` is the camera's in
-    pixels, ``residual`` the fit's RMS over the mean gain, ``deviation`` the standard deviations that
-    the fit itself expects of the shift (metres) and the tilt (degrees), ``pixels`` the number that
-    lie on the screen and are not saturated, ``saturated`` the share that is.
+    ``rig``: with the screen's shift and tilt; ``shown`` (h, w, 3): the pattern through the
+    display's curve, ``gamma`` (3,); its radiance is ``gain`` (3,) times that. ``blur`` is the
+    camera's in pixels, ``residual`` the fit's RMS over the mean gain, ``deviation`` the standard
+    deviations that the fit expects of the shift (metres) and the tilt (degrees), ``pixels`` the
+    number that lie on the screen and are not saturated, ``saturated`` the share that is.
     """
 
     rig: Rig
@@ -134,7 +133,7 @@ class _Fit:
         )
 
     def look(self, u: Array, *images: Array) -> tuple[Array, ...]:
-        """What the pixels average of images (n, n, C) shown on the screen, and the screen's share."""
+        """What the pixels average of images (n, n, C) on the screen, and the screen's share."""
         s, t, _ = screen_coordinates(self.moved(u), self.point, self.mirrored)
         n, count = self.samples, len(images[0])
         ds, dt = (np.maximum(sum(np.abs(g) for g in np.gradient(a)), 1e-6) for a in (s, t))
@@ -198,7 +197,9 @@ class _Fit:
     def solve(self, u: Array, blurred: float, turns: int) -> Array:
         """Damped Gauss–Newton steps from ``u`` on images that are ``blurred`` further."""
         self.blurred = blurred
-        image = ndimage.gaussian_filter(self.image, (blurred, blurred, 0)) if blurred else self.image
+        image = (
+            ndimage.gaussian_filter(self.image, (blurred, blurred, 0)) if blurred else self.image
+        )
         clipped = self.clipped
         if blurred:
             clipped = ndimage.maximum_filter(clipped, (3, 3, 1))
@@ -216,7 +217,7 @@ class _Fit:
             deviation, error = self.errors(image, clipped, p * gain, share, room, spread, gain)
             self.error, self.share, self.scale = error, share, deviation
 
-            def columns(part: Array, other: Array, step: float) -> Array:
+            def columns(step: float, part: Array, other: Array) -> Array:
                 out = (part - p) * gain - (other - share)[..., None] * room  # noqa: B023
                 return np.asarray(out[use] / deviation[use] / step)  # noqa: B023
 
@@ -225,7 +226,7 @@ class _Fit:
                 if free[k]:
                     moved = u.copy()
                     moved[k] += _STEP if k < 6 else 0.1
-                    jacobian[..., k] = columns(*self.look(moved, shown), moved[k] - u[k])
+                    jacobian[..., k] = columns(moved[k] - u[k], *self.look(moved, shown))
             for c in range(3):
                 jacobian[:, c, 6 + c] = (dp * gain / deviation)[use][:, c]
                 jacobian[:, c, 9 + c] = (p * gain / deviation)[use][:, c]
@@ -250,8 +251,8 @@ class _Fit:
         return u
 
     def errors(
-        self, image: Array, clipped: Array, light: Array, share: Array, room: Array, spread: Array,
-        gain: Array,
+        self, image: Array, clipped: NDArray[np.bool_], light: Array, share: Array, room: Array,
+        spread: Array, gain: Array,
     ) -> tuple[Array, Array]:  # fmt: skip
         """The pixels' expected deviation, and their errors over it (H, W, 3), observed - model."""
         model = light + (1 - share)[..., None] * room
@@ -281,8 +282,8 @@ class _Fit:
         gamma, gain = np.exp(u[_GAMMA]), np.exp(u[_GAIN])
         inside = self.share > 0.98
         seen = inside & ~self.clipped.any(-1)
-        residual = (self.error * self.scale)[inside]
-        residual = float(np.sqrt(np.median(residual**2) / 0.455)) / float(gain.mean())
+        error = (self.error * self.scale)[inside]
+        residual = float(np.sqrt(np.median(error**2) / 0.455)) / float(gain.mean())
         spread = np.zeros(6)
         if self.move:
             spread = np.sqrt(np.diag(np.linalg.inv(self.information))[:6])
