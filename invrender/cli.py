@@ -62,9 +62,9 @@ def _parser() -> argparse.ArgumentParser:
     refine.add_argument("--size", type=int, default=256, help="pixels a side of the maps (256)")
     refine.add_argument(
         "--init",
-        choices=["flat"],
-        default="flat",
-        help="where refinement starts; flat: a flat sample, needs no network (default)",
+        choices=["network", "flat"],
+        default="network",
+        help="where refinement starts: the network's maps (default), or flat, which needs no torch",
     )
     refine.add_argument(
         "--samples", type=int, default=64, help="samples a pixel of the specular lobe (64)"

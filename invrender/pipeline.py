@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -52,15 +51,15 @@ def refine_capture(
     out: Path,
     *,
     size: int = 256,
-    init: str = "flat",
+    init: str = "network",
     samples: int = 64,
     ball: tuple[float, float, float] | None = None,
     progress: Callable[[str], None] = lambda stage: None,
 ) -> Report:
     """Recover the maps of a capture and write them, with lights, pictures and report, to ``out``.
 
-    size: pixels a side of the maps. init: "flat" (no network). Raises `InputError` for bad input,
-    before anything is written.
+    size: pixels a side of the maps. init: where refinement starts, "network" or "flat" (needs no
+    torch). Raises `InputError` for bad input, before anything is written.
     """
     folder, out = Path(folder), Path(out)
     if size < 1:
@@ -78,6 +77,7 @@ def refine_capture(
 
     with stage("read"):
         capture = load_capture(folder)
+        reconstruct = _network() if init == "network" else None
     with stage("ball"):
         found = find_ball(capture.photo, capture.rig, ball)
     with stage("lights"):
@@ -89,24 +89,32 @@ def refine_capture(
         # Dr.Jit compiles here; nothing before needs it.
         from invrender.initial import flat_maps
         from invrender.lobes import fit_lobes
-        from invrender.refine import lobe_prior, refine
+        from invrender.refine import correct, lobe_prior, network_prior, refine
         from invrender.render import make_scene, prepare, render
 
         scene = make_scene(capture.rig, lights.pattern, lights.environment, lights.gain)
         prepared = prepare(scene)
-    with stage("initial maps"):
-        start = flat_maps(photo, prepared, samples)
-    with stage("materials"):
-        lobes = fit_lobes(photo, prepared, samples)
+    if reconstruct is None:
+        with stage("initial maps"):
+            start = flat_maps(photo, prepared, samples)
+        with stage("materials"):
+            prior = lobe_prior(fit_lobes(photo, prepared, samples))
+    else:
+        with stage("initial maps"):
+            estimate = reconstruct(
+                photo, capture.rig, lights.pattern, lights.gain, lights.environment,
+                lights.pattern_captured,
+            )  # fmt: skip
+            start, prior = estimate.maps, network_prior(estimate.maps, estimate.sigma)
     with stage("refine"):
-        result = refine(
-            photo,
-            prepared,
-            lobe_prior(lobes),
-            samples=samples,
-            clipped=clipped if clipped.any() else None,
-            progress=lambda i, error: progress(f"refine: step {i}, photo error {error:.4f}"),
-        )
+        seen = clipped if clipped.any() else None
+        if reconstruct is None:
+            result = refine(
+                photo, prepared, prior, samples=samples, clipped=seen,
+                progress=lambda i, error: progress(f"refine: step {i}, photo error {error:.4f}"),
+            )  # fmt: skip
+        else:
+            result = correct(photo, prepared, prior, samples=samples, clipped=seen)
     with stage("render"):
         pictures = [
             render(
@@ -142,6 +150,17 @@ def refine_capture(
     with stage("write"):
         _write(out, report, capture, lights, result.maps, photo, pictures[1])
     return report
+
+
+def _network() -> Any:
+    """The network that comes with the package. Raises `InputError` where torch is missing."""
+    try:
+        from nets.infer import Reconstructor
+    except ModuleNotFoundError as e:
+        raise InputError(
+            f"the network needs {e.name}: pip install 'invrender[nets]', or start flat: --init flat"
+        ) from None
+    return Reconstructor()
 
 
 def crop_mask(photo: Photo, rig: Rig, size: int) -> NDArray[np.bool_]:
@@ -199,9 +218,3 @@ def _write(
         out.mkdir(exist_ok=True)
         for file in sorted(new.iterdir()):
             os.replace(file, out / file.name)
-
-
-def copy_example(folder: Path) -> Path:
-    """The capture that comes with the package, copied to ``folder``."""
-    source = Path(__file__).parent / "data" / "example"
-    return Path(shutil.copytree(source, folder))

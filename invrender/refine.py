@@ -38,6 +38,9 @@ MIN_ROUGHNESS = 0.03
 MAX_SLOPE = 3.0  # 72 degrees
 PHOTO_NOISE = (0.02, 0.01)  # relative to the pixel, and to the photo's mean: sensor and model
 TRUST = (0.1, 0.2)  # how far one step may move roughness and slopes
+SHARE = np.array([1] * 6 + [0] + [0.2] * 2, np.float32)  # of its step that each of θ takes
+LIGHT_NOISE = (0.1, 0.05)  # as PHOTO_NOISE, for what the lights' estimate adds to it
+UNLIKELY = 1.0  # mean squared residual, in its expected spread, from which a pixel counts less
 STOP = 0.02  # relative decrease of the mean cost below which steps end
 
 
@@ -75,6 +78,23 @@ def lobe_prior(maps: Maps) -> Prior:
     for k, r in ((D, 0.98), (S, 0.95)):  # an albedo's channels vary together
         correlation[k, k] = r + (1 - r) * np.eye(3)
     return Prior(mean, sigma, correlation.astype(np.float32))
+
+
+def network_prior(maps: Maps, sigma: dict[str, Array]) -> Prior:
+    """The uncertainty of a network's maps, from what it expects of its errors, (H, W) a map.
+
+    ``sigma`` of normals is that of n/2 + 1/2.
+    """
+    mean = to_theta(maps)
+    spread = np.empty_like(mean)
+    spread[..., D] = sigma["diffuse"][..., None]
+    spread[..., S] = sigma["specular"][..., None]
+    spread[..., R] = sigma["roughness"]
+    spread[..., N] = 2 * sigma["normal"][..., None]
+    correlation = np.eye(9)
+    for k, r in ((D, 0.9), (S, 0.95)):
+        correlation[k, k] = r + (1 - r) * np.eye(3)
+    return Prior(mean, np.maximum(spread, 1e-4), correlation.astype(np.float32))
 
 
 def to_theta(maps: Maps) -> Array:
@@ -195,6 +215,50 @@ def refine(
         result.sigma = sigma * np.sqrt(np.clip(left, 0, 1))
     result.maps = to_maps(theta)
     return result
+
+
+def correct(
+    photo: Array,
+    prepared: Tables | Unbiased,
+    prior: Prior,
+    *,
+    samples: int = 64,
+    clipped: NDArray[np.bool_] | None = None,
+) -> Refined:
+    """One cautious step from a prior whose errors are shared by whole materials.
+
+    A network errs alike over a material, so what a pixel's own three numbers say of roughness or
+    slopes is mostly an error of something else. As in the Schmidt–Kalman filter, every parameter's
+    uncertainty counts in the expected spread of the residual, but each takes only its `SHARE` of
+    the step. The posterior is that of this suboptimal gain K: (1 - KJ)Σ(1 - KJ)ᵀ + KRKᵀ.
+    """
+    began = time.perf_counter()
+    mean = max(float(photo.mean()), 1e-12)
+    noise = (LIGHT_NOISE[0] * photo) ** 2 + (LIGHT_NOISE[1] * mean) ** 2
+    if clipped is not None:
+        noise = np.where(clipped[..., None], np.float32(1e12) * mean**2, noise)
+    theta = project(prior.mean.copy())
+    image, jacobian = linearise(prepared, theta, samples)
+    residual = photo - image
+    a = jacobian * prior.sigma[..., None, :]
+    ac = a @ prior.correlation
+    spread = ac @ np.swapaxes(a, -1, -2)
+    spread[..., range(3), range(3)] += noise
+    inverse = np.linalg.inv(spread)
+    surprise = np.einsum("hwc,hwcd,hwd->hw", residual, inverse, residual) / 3
+    trust = np.sqrt(np.minimum(1, UNLIKELY / np.maximum(surprise, 1e-12)))
+    gain = SHARE[:, None] * trust[..., None, None] * (np.swapaxes(ac, -1, -2) @ inverse)
+    z = np.einsum("hwpc,hwc->hwp", gain, residual)
+    theta = project((theta + prior.sigma * z).astype(np.float32))
+    rest = np.eye(9, dtype=np.float32) - gain @ a
+    variance = np.einsum("hwpq,qr,hwpr->hwp", rest, prior.correlation, rest)
+    measured = np.where(noise > 1e6 * mean**2, 0, noise)  # where clipped, the gain is nought
+    variance += np.einsum("hwpc,hwc,hwpc->hwp", gain, measured, gain)
+    seen = residual if clipped is None else residual[~clipped]
+    error = float(np.sqrt(np.mean(seen**2))) / mean if seen.size else 0.0
+    history = [{"seconds": time.perf_counter() - began, "photo_error": error}]
+    sigma = prior.sigma * np.sqrt(np.clip(variance, 0, None))
+    return Refined(to_maps(theta), sigma, history, converged=True)
 
 
 if __name__ == "__main__":

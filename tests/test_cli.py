@@ -21,8 +21,20 @@ def capture(tmp_path):
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
     out = tmp_path_factory.mktemp("result") / "out"
-    assert main(["refine", "example", "-o", str(out), "--size", "96", "--quiet"]) == 0
+    command = ["refine", "example", "-o", str(out), "--size", "96", "--init", "flat", "--quiet"]
+    assert main(command) == 0
     return out
+
+
+def test_network_starts_nearer(result, tmp_path):
+    """The network's maps are nearer the truth than a flat sample's and its refinement's."""
+    out = tmp_path / "out"
+    assert main(["refine", "example", "-o", str(out), "--size", "96", "--quiet"]) == 0
+    flat, network = (
+        json.loads((folder / "report.json").read_text())["map_error"] for folder in (result, out)
+    )
+    assert network["initial"]["average"] < 0.8 * flat["refined"]["average"]
+    assert network["refined"]["average"] < 0.8 * flat["refined"]["average"]
 
 
 def test_result_is_complete(result):
@@ -51,7 +63,8 @@ def test_without_torch(tmp_path):
         "            raise ImportError(name)\n"
         "sys.meta_path.insert(0, Block())\n"
         "from invrender.cli import main\n"
-        f"sys.exit(main(['refine', 'example', '-o', {str(tmp_path / 'out')!r}, '--size', '16']))"
+        f"sys.exit(main(['refine', 'example', '-o', {str(tmp_path / 'out')!r}, '--size', '16',"
+        " '--init', 'flat']))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -11,8 +11,10 @@ from invrender.pattern import block_pattern
 from invrender.refine import (
     MIN_ROUGHNESS,
     Prior,
+    correct,
     linearise,
     lobe_prior,
+    network_prior,
     refine,
     to_maps,
     to_theta,
@@ -143,3 +145,20 @@ def test_one_pixel(prepared):
     photo = np.full((1, 1, 3), 0.1, np.float32)
     result = refine(photo, prepared, lobe_prior(fit_lobes(photo, prepared)))
     assert result.maps.shape == (1, 1)
+
+
+def test_correction_of_a_networks_maps(prepared, environment):
+    """Wrong albedos move to the truth, roughness stays, and what is clipped keeps its prior."""
+    truth = constant_maps(SIZE, SIZE, 0.4, 0.04, 0.5)
+    start = constant_maps(SIZE, SIZE, 0.48, 0.04, 0.5)
+    sigma = {k: np.full((SIZE, SIZE), 0.05, np.float32) for k in ("diffuse", "roughness", "normal")}
+    sigma["specular"] = np.full((SIZE, SIZE), 0.005, np.float32)
+    clipped = np.zeros((SIZE, SIZE), bool)
+    clipped[:8] = True
+    prior = network_prior(start, sigma)
+    result = correct(photo_of(truth, environment), prepared, prior, clipped=clipped)
+    assert map_errors(result.maps, truth)["diffuse"] < 0.7 * map_errors(start, truth)["diffuse"]
+    assert np.array_equal(result.maps.roughness, start.roughness)
+    assert result.maps.diffuse[:8] == pytest.approx(start.diffuse[:8], abs=1e-5)
+    assert (result.sigma <= prior.sigma * 1.0001).all()
+    assert (result.sigma[8:, :, 0] < 0.95 * prior.sigma[8:, :, 0]).all()
