@@ -16,6 +16,7 @@ from invrender.images import Photo, read_image, read_photo
 from invrender.maps import Maps, read_maps
 from invrender.mirror import Ball
 from invrender.rig import Rig, read_rig
+from invrender.screen import fit_screen
 from invrender.unfold import (
     fill_environment,
     predict_pattern,
@@ -27,6 +28,11 @@ from invrender.unfold import (
 Array = NDArray[np.floating[Any]]
 PHOTO_NAMES = tuple(f"photo.{e}" for e in ("exr", "tif", "tiff", "png", "jpg", "jpeg"))
 MIN_PHOTO = 64
+
+POOR = 0.01  # residual of the ideal pattern from which the screen itself is in doubt
+# Shift in sizes of the sample, and tilt in degrees, that an error of the ball's place, a hundredth
+# of its radius, cannot explain: a smaller one is taken for such an error.
+MOVED = (0.055, 2.5)
 
 
 @dataclass(frozen=True)
@@ -53,7 +59,9 @@ class Lights:
     is ``gain`` (3,) times ``pattern`` (h, w, 3); ``pattern_captured`` is what the ball shows of it,
     rectified. ``fit`` tells how well: ``residual`` of the pattern's fit relative to the gain,
     ``gamma`` the exponent on the pattern that fits best (1: as it should be; the gain is for 1),
-    ``blur`` the camera's in pixels, ``pixels`` the number used.
+    ``blur`` the camera's in pixels, ``pixels`` the number used. Where the pattern as it should be
+    fits badly, ``pattern`` is as the display really shows it, and ``rig`` as the screen really
+    hangs; else both are those of the capture.
     """
 
     environment: Array
@@ -61,6 +69,7 @@ class Lights:
     pattern: Array
     gain: Array
     pattern_captured: Array
+    rig: Rig
     fit: dict[str, float] = field(default_factory=dict)
 
 
@@ -221,8 +230,23 @@ def extract_lights(capture: Capture, ball: Ball, height: int = 128) -> Lights:
         raise InputError("the ball was found in a photo of another size")
     if height < 8 or height % 2:
         raise InputError(f"the environment needs an even height of 8 rows or more, got {height}")
+    pattern = capture.pattern
+    gain, fit = fit_gain(photo, rig, ball, pattern)
+    if fit["residual"] > POOR:
+        screen = fit_screen(photo, rig, ball, pattern)
+        if screen.residual < 0.5 * fit["residual"]:
+            pattern, gain = screen.shown, screen.gain
+            shift, tilt = (
+                np.linalg.norm(screen.rig.screen_shift),
+                np.linalg.norm(screen.rig.screen_tilt),
+            )
+            if shift > MOVED[0] * rig.sample_size or tilt > MOVED[1]:
+                rig = screen.rig
+            fit |= {
+                "residual": screen.residual, "gamma": float(np.mean(screen.gamma)),
+                "screen_shift": float(shift), "screen_tilt": float(tilt),
+            }  # fmt: skip
     environment, coverage = unfold_environment(photo, rig, ball, height)
     environment = fill_environment(environment, coverage)
-    gain, fit = fit_gain(photo, rig, ball, capture.pattern)
-    captured = unfold_pattern(photo, rig, ball, min(256, max(capture.pattern.shape[:2])))
-    return Lights(environment, coverage, capture.pattern, gain, captured, fit)
+    captured = unfold_pattern(photo, rig, ball, min(256, max(pattern.shape[:2])))
+    return Lights(environment, coverage, pattern, gain, captured, rig, fit)

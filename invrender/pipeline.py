@@ -11,19 +11,22 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from invrender.ball import find_ball
-from invrender.capture import Capture, Lights, crop_sample, extract_lights, load_capture
+from invrender.capture import Lights, crop_sample, extract_lights, load_capture
 from invrender.errors import InputError
 from invrender.images import Photo, write_exr, write_png
-from invrender.maps import Maps, map_errors, write_maps
+from invrender.maps import map_errors, write_maps
 from invrender.materials import resize_maps
 from invrender.rig import Rig
+
+if TYPE_CHECKING:  # Dr.Jit compiles where the refinement is imported
+    from invrender.refine import Refined
 
 Array = NDArray[np.floating[Any]]
 FINAL_SAMPLES = 256
@@ -83,8 +86,9 @@ def refine_capture(
     with stage("lights"):
         lights = extract_lights(capture, found)
     with stage("crop"):
-        photo = crop_sample(capture.photo, capture.rig, size)
-        clipped = crop_mask(capture.photo, capture.rig, size)
+        rig = lights.rig
+        photo = crop_sample(capture.photo, rig, size)
+        clipped = crop_mask(capture.photo, rig, size)
     with stage("forward model"):
         # Dr.Jit compiles here; nothing before needs it.
         from invrender.initial import flat_maps
@@ -92,7 +96,7 @@ def refine_capture(
         from invrender.refine import correct, lobe_prior, network_prior, refine
         from invrender.render import make_scene, prepare, render
 
-        scene = make_scene(capture.rig, lights.pattern, lights.environment, lights.gain)
+        scene = make_scene(rig, lights.pattern, lights.environment, lights.gain)
         prepared = prepare(scene)
     if reconstruct is None:
         with stage("initial maps"):
@@ -102,7 +106,7 @@ def refine_capture(
     else:
         with stage("initial maps"):
             estimate = reconstruct(
-                photo, capture.rig, lights.pattern, lights.gain, lights.environment,
+                photo, rig, lights.pattern, lights.gain, lights.environment,
                 lights.pattern_captured,
             )  # fmt: skip
             start, prior = estimate.maps, network_prior(estimate.maps, estimate.sigma)
@@ -118,7 +122,7 @@ def refine_capture(
     with stage("render"):
         pictures = [
             render(
-                capture.rig, maps, lights.pattern, lights.environment, lights.gain,
+                rig, maps, lights.pattern, lights.environment, lights.gain,
                 samples=FINAL_SAMPLES,
             )
             for maps in (start, result.maps)
@@ -148,7 +152,7 @@ def refine_capture(
         versions={n: version(n) for n in ("invrender", "drjit", "mitsuba", "numpy")},
     )
     with stage("write"):
-        _write(out, report, capture, lights, result.maps, photo, pictures[1])
+        _write(out, report, lights, result, photo, pictures[1])
     return report
 
 
@@ -161,6 +165,16 @@ def _network() -> Any:
             f"the network needs {e.name}: pip install 'invrender[nets]', or start flat: --init flat"
         ) from None
     return Reconstructor()
+
+
+def deviations(sigma: Array) -> dict[str, Array]:
+    """Standard deviation of each map from those of θ (H, W, 9); of normals that of n/2 + 1/2."""
+    slopes = np.sqrt(np.mean(sigma[..., 7:9] ** 2, -1)) / 2
+    parts = {
+        "diffuse": sigma[..., 0:3], "specular": sigma[..., 3:6],
+        "roughness": sigma[..., 6], "normal": slopes,
+    }  # fmt: skip
+    return {k: np.ascontiguousarray(v, np.float32) for k, v in parts.items()}
 
 
 def crop_mask(photo: Photo, rig: Rig, size: int) -> NDArray[np.bool_]:
@@ -194,9 +208,8 @@ def _warnings(clipped: NDArray[np.bool_], converged: bool) -> list[str]:
 def _write(
     out: Path,
     report: Report,
-    capture: Capture,
     lights: Lights,
-    maps: Maps,
+    result: Refined,
     photo: Array,
     picture: Array,
 ) -> None:
@@ -205,8 +218,10 @@ def _write(
     white = max(float(np.percentile(photo, 99.5)), 1e-12)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".") as name:
         new = Path(name)
-        write_maps(new, maps)
-        for key, image in maps.encoded().items():
+        write_maps(new, result.maps)
+        for key, image in deviations(result.sigma).items():
+            write_exr(new / f"sigma_{key}.exr", image)
+        for key, image in result.maps.encoded().items():
             write_png(new / f"{key}.png", image, linear=key in ("normal", "roughness"))
         write_exr(new / "environment.exr", lights.environment)
         write_exr(new / "pattern.exr", lights.pattern_captured)

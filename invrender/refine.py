@@ -83,12 +83,13 @@ def lobe_prior(maps: Maps) -> Prior:
 def network_prior(maps: Maps, sigma: dict[str, Array]) -> Prior:
     """The uncertainty of a network's maps, from what it expects of its errors, (H, W) a map.
 
-    ``sigma`` of normals is that of n/2 + 1/2.
+    ``sigma`` of normals is that of n/2 + 1/2. An albedo's error within a material is at most a
+    share of it.
     """
     mean = to_theta(maps)
     spread = np.empty_like(mean)
-    spread[..., D] = sigma["diffuse"][..., None]
-    spread[..., S] = sigma["specular"][..., None]
+    spread[..., D] = np.minimum(sigma["diffuse"][..., None], 0.01 + 0.15 * maps.diffuse)
+    spread[..., S] = np.minimum(sigma["specular"][..., None], 0.01 + 0.3 * maps.specular)
     spread[..., R] = sigma["roughness"]
     spread[..., N] = 2 * sigma["normal"][..., None]
     correlation = np.eye(9)
