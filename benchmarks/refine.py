@@ -76,6 +76,7 @@ def main() -> None:
     parser.add_argument("--materials", type=Path, help="folder of materials")
     parser.add_argument("--envs", type=Path, help="folder of environments")
     parser.add_argument("--count", type=int, default=8)
+    parser.add_argument("--init", choices=["network", "flat"], default="network")
     args = parser.parse_args()
     args.count = 2 if args.quick else args.count
     args.size, args.width, args.spp = (96, 480, 8) if args.quick else (256, 960, 32)
@@ -83,7 +84,9 @@ def main() -> None:
 
     rows: list[dict[str, Any]] = []
     for folder in make_captures(args):
-        report = refine_capture(folder, args.out / "results" / folder.name, size=args.size)
+        report = refine_capture(
+            folder, args.out / "results" / folder.name, size=args.size, init=args.init
+        )
         assert report.map_error is not None
         rows.append(
             {

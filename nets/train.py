@@ -112,13 +112,15 @@ class Trainer:
         self.network.load_state_dict(pick("weights."))
         self.mean = {k: v.to(self.device) for k, v in pick("mean.").items()}
         adam = self.optimiser.state_dict()
-        names = [k for k, _ in self.network.named_parameters()]
-        keys = ("step", "exp_avg", "exp_avg_sq")
-        adam["state"] = {
-            i: {k: state[f"adam.{name}.{k}"] for k in keys}
-            for i, name in enumerate(names)
-            if f"adam.{name}.step" in state
-        }
+        adam["state"] = {}
+        for i, (name, p) in enumerate(self.network.named_parameters()):
+            if f"adam.{name}.step" in state:
+                # The fused optimiser needs the parameter's own memory layout.
+                moments = {
+                    k: torch.empty_like(p).copy_(state[f"adam.{name}.{k}"])
+                    for k in ("exp_avg", "exp_avg_sq")
+                }
+                adam["state"][i] = {"step": state[f"adam.{name}.step"], **moments}
         self.optimiser.load_state_dict(adam)
         return True
 
