@@ -63,7 +63,7 @@ def find_ball(photo: Photo, rig: Rig, manual: tuple[float, float, float] | None 
             "read: take a larger photo or check rig.toml"
         )
     middle = np.asarray(expected.centre)
-    view = make_view(photo, middle, (SEARCH + 1.5) * expected.radius, expected.radius / 48)
+    view = _view(photo, middle, (SEARCH + 1.5) * expected.radius, expected.radius / 48)
     starts = []
     for start in _coarse(view, rig, expected):
         theta = _climb(view, rig, start, 2, 0.08, 25)
@@ -79,7 +79,7 @@ def find_ball(photo: Photo, rig: Rig, manual: tuple[float, float, float] | None 
         raise InputError("no mirror ball found: the photo shows nothing where the rig puts it")
     found = make_ball(rig, np.array([theta[0], theta[1], 0.0]), theta[2], size)
     confidence = _confidence(view, rig, theta)
-    fine = make_view(photo, np.asarray(found.centre), 1.6 * found.radius, found.radius / 160)
+    fine = _view(photo, np.asarray(found.centre), 1.6 * found.radius, found.radius / 160)
     theta = _polish(fine, rig, theta)
     ball = make_ball(rig, np.array([theta[0], theta[1], 0.0]), theta[2], size, confidence)
     (x, y), r = ball.centre, ball.radius
@@ -130,9 +130,7 @@ class _View:
         return (rig.project(points, *self.size) - self.origin) / self.step
 
 
-def make_view(
-    photo: Photo, middle: Array, reach: float, shrink: float, sigma: float = 1.2
-) -> _View:
+def _view(photo: Photo, middle: Array, reach: float, shrink: float, sigma: float = 1.2) -> _View:
     step = max(1, round(shrink))
     low = np.maximum(np.floor(middle - reach), 0).astype(int)
     high = np.minimum(np.ceil(middle + reach), [photo.width, photo.height]).astype(int)
@@ -170,7 +168,7 @@ def _normals(curve: Array) -> Array:
     return np.asarray(normal * np.where(outward < 0, -1, 1))
 
 
-def alignment(view: _View, curve: Array, normal: Array) -> Array:
+def _alignment(view: _View, curve: Array, normal: Array) -> Array:
     """How much of an edge runs along a curve at each of its points, (n,) in [0, 1].
 
     The share of the structure tensor across the curve, with the usual trace added below so that
@@ -190,8 +188,8 @@ def _score(
 ) -> tuple[float, float, float, float]:
     """Weighted sum of: the horizon's and the outline's share of edge, the mirrored table's fit."""
     horizon, hn, outline, on = _curves(view, rig, theta, count)
-    h = float(alignment(view, horizon, hn).mean())
-    o = float(alignment(view, outline, on).mean())
+    h = float(_alignment(view, horizon, hn).mean())
+    o = float(_alignment(view, outline, on).mean())
     m = _mirrored(view, rig, theta, blur)
     return h + OUTLINE_WEIGHT * o + MIRROR_WEIGHT * m, h, o, m
 
@@ -347,7 +345,7 @@ def _polish(view: _View, rig: Rig, theta: Array, reach: float = 0.05) -> Array:
 
         moves = [theta + np.eye(3)[k] * theta[2] * 2e-3 for k in range(3)]
         curve, normal = _curves(view, rig, theta, 240)[:2]
-        edge, strength = edge_offsets(view, curve, normal, near)
+        edge, strength = _edges(view, curve, normal, near)
         shifted = [_curves(view, rig, m, 240)[0] for m in moves]
         edge_slope = np.stack([np.sum((m - curve) * normal, -1) for m in shifted], -1) * 500
         valid = np.repeat(_mirror_difference(view, rig, theta)[1], 3)
@@ -371,7 +369,7 @@ def _polish(view: _View, rig: Rig, theta: Array, reach: float = 0.05) -> Array:
     return theta
 
 
-def edge_offsets(view: _View, curve: Array, normal: Array, reach: float) -> tuple[Array, Array]:
+def _edges(view: _View, curve: Array, normal: Array, reach: float) -> tuple[Array, Array]:
     """Signed distance (n,) along each normal to the strongest edge, and its weight in [0, 1]."""
     t = np.arange(-math.ceil(reach * 4) - 8, math.ceil(reach * 4) + 9) / 4
     at = curve[:, None] + t[None, :, None] * normal[:, None]

@@ -148,6 +148,22 @@ def linearise(
     return rows(j.radiance).copy(), np.nan_to_num(jacobian, posinf=0, neginf=0)
 
 
+def _noise(
+    photo: Array, mean: float, share: tuple[float, float], clipped: NDArray[np.bool_] | None
+) -> Array:
+    """Variance (H, W, 3) of the photo: shares of the pixel and of the mean, or nothing measured."""
+    noise = (share[0] * photo) ** 2 + (share[1] * mean) ** 2
+    if clipped is not None:
+        noise = np.where(clipped[..., None], np.float32(1e12) * mean**2, noise)
+    return noise
+
+
+def _photo_error(residual: Array, mean: float, clipped: NDArray[np.bool_] | None) -> float:
+    """RMS residual of what the photo measures, over its mean."""
+    seen = residual if clipped is None else residual[~clipped]
+    return float(np.sqrt(np.mean(seen**2))) / mean if seen.size else 0.0
+
+
 def refine(
     photo: Array,
     prepared: Tables | Unbiased,
@@ -166,9 +182,7 @@ def refine(
     """
     began = time.perf_counter()
     mean = max(float(photo.mean()), 1e-12)
-    noise = (PHOTO_NOISE[0] * photo) ** 2 + (PHOTO_NOISE[1] * mean) ** 2
-    if clipped is not None:
-        noise = np.where(clipped[..., None], np.float32(1e12) * mean**2, noise)
+    noise = _noise(photo, mean, PHOTO_NOISE, clipped)
     sigma, correlation = prior.sigma, prior.correlation
     precision = np.linalg.inv(correlation)
 
@@ -184,8 +198,7 @@ def refine(
     length = np.ones(cost.shape, np.float32)
     result = Refined(to_maps(theta), sigma)
     for i in range(iterations + 1):
-        seen = residual if clipped is None else residual[~clipped]
-        error = float(np.sqrt(np.mean(seen**2))) / mean if seen.size else 0.0
+        error = _photo_error(residual, mean, clipped)
         seconds = time.perf_counter() - began
         result.history.append(
             {"seconds": seconds, "photo_error": error, "cost": float(cost.mean())}
@@ -235,9 +248,7 @@ def correct(
     """
     began = time.perf_counter()
     mean = max(float(photo.mean()), 1e-12)
-    noise = (LIGHT_NOISE[0] * photo) ** 2 + (LIGHT_NOISE[1] * mean) ** 2
-    if clipped is not None:
-        noise = np.where(clipped[..., None], np.float32(1e12) * mean**2, noise)
+    noise = _noise(photo, mean, LIGHT_NOISE, clipped)
     theta = project(prior.mean.copy())
     image, jacobian = linearise(prepared, theta, samples)
     residual = photo - image
@@ -255,8 +266,7 @@ def correct(
     variance = np.einsum("hwpq,qr,hwpr->hwp", rest, prior.correlation, rest)
     measured = np.where(noise > 1e6 * mean**2, 0, noise)  # where clipped, the gain is nought
     variance += np.einsum("hwpc,hwc,hwpc->hwp", gain, measured, gain)
-    seen = residual if clipped is None else residual[~clipped]
-    error = float(np.sqrt(np.mean(seen**2))) / mean if seen.size else 0.0
+    error = _photo_error(residual, mean, clipped)
     history = [{"seconds": time.perf_counter() - began, "photo_error": error}]
     sigma = prior.sigma * np.sqrt(np.clip(variance, 0, None))
     return Refined(to_maps(theta), sigma, history, converged=True)
