@@ -32,26 +32,39 @@ ALBEDO = 0.6
 ROUGHNESS = (0.2, 0.6)
 BASIS = ((0.2, 0.0), (0.2, 0.6), (0.6, 0.0), (0.6, 0.6))  # (ρ, k_d)
 WHITE = 3  # of BASIS: nearly Lambertian, 0.6 of a white plane
+SLOPED = (3, 2, 0)  # of BASIS, in the order of the slope clues
 CLUE_SIZE = 48
 BALL_SIZE = 32
 PATTERN_SIZE = 32
 SAMPLES = 64
 
 
-def plane_clues(scene: Scene, size: int = CLUE_SIZE, samples: int = SAMPLES) -> Array:
-    """Radiance (size, size, 12) of the four materials of `BASIS`, flat, over the sample."""
+def plane_clues(scene: Scene, size: int = CLUE_SIZE, samples: int = SAMPLES) -> tuple[Array, Array]:
+    """Radiance (size, size, 12) of the four materials of `BASIS`, flat, over the sample; and that
+    of the `SLOPED` ones' derivatives along the slopes p and q of n ∝ (p, q, 1), (size, size, 18).
+    """
     prepared = prepare(scene)
     vec3 = vector(scene.scalar, 3)
     view = make_view(scene, size, size)
     up = vec3(*(dr.opaque(scene.scalar, c) for c in (0.0, 0.0, 1.0)))
-    parts = [shade(prepared, view, dr.opaque(Float, r), up, samples) for r in ROUGHNESS]
-    dr.eval([(p.irradiance, p.b, p.a) for p in parts])  # one launch for both
-    images = []
-    for rho, k_d in BASIS:
-        p = parts[ROUGHNESS.index(rho)]
-        color = p.irradiance * (k_d / np.pi) + p.b * (ALBEDO - k_d) + p.a
-        images.append(np.broadcast_to(np.asarray(color).T, (size * size, 3)))
-    return np.concatenate(images, -1).reshape(size, size, 12).astype(np.float32)
+    shadings = [shade(prepared, view, dr.opaque(Float, r), up, samples, True) for r in ROUGHNESS]
+    # Radiance, then along p and q: the tangents of the plane's own frame are x and y.
+    parts = [[(s.irradiance, s.b, s.a), s.tangents[1], s.tangents[2]] for s in shadings]
+    dr.eval(parts)  # one launch for all
+
+    def image(material: int, row: int) -> Array:
+        rho, k_d = BASIS[material]
+        e, b, a = parts[ROUGHNESS.index(rho)][row]
+        color = e * (k_d / np.pi) + b * (ALBEDO - k_d) + a
+        return np.broadcast_to(np.asarray(color).T, (size * size, 3))
+
+    def stack(images: list[Array]) -> Array:
+        return np.concatenate(images, -1).reshape(size, size, -1).astype(np.float32)
+
+    return (
+        stack([image(m, 0) for m in range(len(BASIS))]),
+        stack([image(m, row) for row in (1, 2) for m in SLOPED]),
+    )
 
 
 def six(clues: Array) -> Array:
@@ -90,14 +103,16 @@ def light_inputs(
     pattern (P, P, 3) relative radiance, gain RGB; environment (H, 2H, 3) radiance or None;
     ``captured``: the screen's radiance as the ball shows it, if that is known. Returns, channels
     first: env_clues (12, h, h) with the screen a black occluder, active_clues (12, h, h),
+    slope_clues (18, h, h) of both lights together,
     sky (9, ·, ·), screen (6, ·, ·), ball (3, ·, ·), pattern (3, ·, ·), rig (12,).
     """
     gain = np.broadcast_to(np.asarray(gain, np.float32), 3)
     if not (np.any(pattern > 0) and np.any(gain > 0)):
         pattern, gain = np.ones((16, 16, 3), np.float32), np.zeros(3, np.float32)
     lit = pattern * gain
+    active, slopes = plane_clues(make_scene(rig, pattern, None, gain), size, samples)
     out = {
-        "active_clues": plane_clues(make_scene(rig, pattern, None, gain), size, samples),
+        "active_clues": active,
         "screen": _levels(prefilter_screen(lit, ROUGHNESS, _relative_height(rig))),
         "pattern": area_resize(lit if captured is None else captured, PATTERN_SIZE),
         "rig": pack_rig(rig),
@@ -106,13 +121,15 @@ def light_inputs(
         # A screen without gain still hides what is behind it.
         dark = make_scene(rig, np.ones_like(pattern), environment, gain=0.0)
         masked = mask_environment(environment, rig)
-        out["env_clues"] = plane_clues(dark, size, samples)
+        out["env_clues"], more = plane_clues(dark, size, samples)
+        slopes = slopes + more
         out["sky"] = _levels(prefilter_sky(masked, (*ROUGHNESS, None)))
         out["ball"] = ball_image(resample_environment(masked, 64))
     else:
         sky = prefilter_sky(np.zeros((4, 8, 3)), (*ROUGHNESS, None))
         out |= {"env_clues": np.zeros((size, size, 12)), "sky": _levels(sky)}
         out["ball"] = np.zeros((BALL_SIZE, BALL_SIZE, 3))
+    out["slope_clues"] = slopes
     return {
         k: np.ascontiguousarray(np.moveaxis(v, -1, 0) if v.ndim == 3 else v, np.float32)
         for k, v in out.items()

@@ -273,6 +273,7 @@ def _pack(sample: Sample, unit: float, maps: Maps) -> Sample:
     sample["photo"] = np.moveaxis(sample["photo"], -1, 0)
     sample["ideal"] = np.moveaxis(sample["ideal"], -1, 0)
     out = {k: np.clip(sample[k] / unit, 0, 6e4).astype(np.float16) for k in RADIANCE}
+    out["slope_clues"] = np.clip(sample["slope_clues"] / unit, -6e4, 6e4).astype(np.float16)
     out["rig"] = sample["rig"].astype(np.float32)
     normal = maps.normal[..., :2] / 2 + 0.5
     stacked = [normal, maps.diffuse, maps.roughness[..., None], maps.specular]

@@ -4,8 +4,8 @@ Image encoder → normal decoder → initial normals → normal clues (split-sum
 pass) → clue encoder; both bottlenecks → fusion → material decoder. A batch is a dict of tensors:
 
     photo (B, 3, H, W) radiance; position (B, 2, H, W) in [-1, 1]², x right, y up; and the light as
-    `nets.clues.light_inputs` gives it, each with a batch axis: env_clues, active_clues, sky,
-    screen, ball, pattern, rig.
+    `nets.clues.light_inputs` gives it, each with a batch axis: env_clues, active_clues,
+    slope_clues, sky, screen, ball, pattern, rig.
 
 All of it may be in any unit of radiance: it is divided by that of a white plane first.
 """
@@ -25,6 +25,7 @@ from torch import Tensor, nn
 
 from invrender.errors import InputError
 from nets.blocks import Decoder, Encoder, Pointwise, blocks, pad_to
+from nets.slopes import SLOPE_FEATURES, slope_features
 from nets.splitsum import (
     brdf_table,
     hit_screen,
@@ -40,7 +41,7 @@ ALBEDO = 0.6
 BASIS = ((0.2, 0.0), (0.2, 0.6), (0.6, 0.0), (0.6, 0.6))
 CLUES = ("none", "mirrorball", "plane", "colored", "full")
 MAPS = ("normal", "diffuse", "roughness", "specular")
-LIGHTS = ("env_clues", "active_clues", "sky", "screen", "ball", "pattern")
+LIGHTS = ("env_clues", "active_clues", "slope_clues", "sky", "screen", "ball", "pattern")
 MIN_SIGMA, MAX_SIGMA = 0.002, 1.0
 
 
@@ -50,6 +51,7 @@ class Config:
     full (and normal clues in grey) or colored (those in colour).
 
     active: clues of the screen's light too, and the ratio of the photo to a white plane.
+    slopes: how radiance depends on the slopes, and what that says of them (`nets.slopes`).
     clue_skips: the material decoder also gets the clue encoder's skips. narrow_fusion: halve the
     channels before the fusion blocks, not after.
     """
@@ -60,6 +62,7 @@ class Config:
     decoder: tuple[int, ...] = (1, 1, 1, 1)
     clues: str = "full"
     active: bool = True
+    slopes: bool = True
     clue_skips: bool = True
     narrow_fusion: bool = True
     denoiser: bool = False
@@ -73,7 +76,7 @@ PRESETS = {
     "small": Config(),
     "paper": Config(
         32, (2, 2, 4, 8), 12, (2, 2, 2, 2),
-        active=False, clue_skips=False, narrow_fusion=False, denoiser=True,
+        active=False, slopes=False, clue_skips=False, narrow_fusion=False, denoiser=True,
     ),
     "tiny": Config(8, (1, 1), 1, (1, 1)),  # for tests
 }  # fmt: skip
@@ -171,6 +174,10 @@ class Network(nn.Module):
                 white = white + plane[:, 9:12]
             ratio = photo / (white / ALBEDO + 0.02)
             inputs += [ratio.clamp(max=4), encode(torch.cat([active[:, :3], active[:, 6:]], 1))]
+        if self.config.slopes:
+            inputs.append(
+                slope_features(photo, active + plane, sample(batch["slope_clues"], position))
+            )
 
         x, skips = self.encoder(_last(torch.cat(inputs, 1)))
         slope0 = self.normal_decoder(x, skips)
@@ -221,7 +228,7 @@ def _knows_environment(config: Config) -> bool:
 
 def _channels(config: Config) -> tuple[int, int]:
     """Input channels of the image encoder and of the clue encoder."""
-    image = 8 + (12 if config.active else 0)
+    image = 8 + (12 if config.active else 0) + (SLOPE_FEATURES if config.slopes else 0)
     lit = 6 if config.active else 0
     clue = {
         "none": 0, "mirrorball": 3, "plane": 12, "full": 16 + lit, "colored": 24 + lit,
@@ -248,8 +255,8 @@ def normalise(batch: Batch, config: Config | None = None) -> Batch:
     out = dict(batch)
     for key in ("photo", "target", *LIGHTS):
         if key in batch:
-            x = batch[key] * scale[:, None, None, None]
-            out[key] = torch.nan_to_num(x, 0.0, 1e3, 0.0).clamp(0, 1e4)
+            x = torch.nan_to_num(batch[key] * scale[:, None, None, None], 0.0, 1e3, 0.0)
+            out[key] = x.clamp(-1e4 if key == "slope_clues" else 0, 1e4)
     return out
 
 

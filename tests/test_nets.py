@@ -7,10 +7,11 @@ torch = pytest.importorskip("torch")
 
 from invrender.environments import procedural_environment, scale_environment  # noqa: E402
 from invrender.errors import InputError  # noqa: E402
+from invrender.maps import constant_maps  # noqa: E402
 from invrender.pattern import block_pattern  # noqa: E402
 from invrender.rig import Rig  # noqa: E402
 from invrender.scene import make_scene  # noqa: E402
-from nets import clues, splitsum  # noqa: E402
+from nets import clues, slopes, splitsum  # noqa: E402
 from nets.blocks import NAFBlock, pad_to  # noqa: E402
 from nets.infer import Reconstructor, _tiles  # noqa: E402
 from nets.loader import positions  # noqa: E402
@@ -43,6 +44,16 @@ def shaken(network, seed=0):
             if name.endswith(("beta", "gamma")):
                 p.normal_(0, 0.3)
     return network.eval()
+
+
+def radiance_of(scene, maps):
+    from invrender.render import material_from_maps, prepare, radiance
+    from invrender.scene import make_view
+
+    view = make_view(scene, *maps.shape)
+    return np.asarray(radiance(prepare(scene), view, material_from_maps(maps), 64)).T.reshape(
+        *maps.shape, 3
+    )
 
 
 # --- blocks ---------------------------------------------------------------------------------------
@@ -91,9 +102,9 @@ def test_padding_repeats_the_border():
 def test_dark_screen_hides_the_room():
     """With no gain the screen still blocks the light behind it."""
     pattern, room = np.ones((32, 32, 3)), np.ones((16, 32, 3))
-    free = clues.plane_clues(make_scene(RIG, None, room), 8, 16)[..., 9:]
-    dark = clues.plane_clues(make_scene(RIG, pattern, room, gain=0.0), 8, 16)[..., 9:]
-    lit = clues.plane_clues(make_scene(RIG, pattern, None), 8, 16)[..., 9:]
+    free = clues.plane_clues(make_scene(RIG, None, room), 8, 16)[0][..., 9:]
+    dark = clues.plane_clues(make_scene(RIG, pattern, room, gain=0.0), 8, 16)[0][..., 9:]
+    lit = clues.plane_clues(make_scene(RIG, pattern, None), 8, 16)[0][..., 9:]
     # White room and white screen of the same radiance: what is hidden is what the screen adds.
     np.testing.assert_allclose(dark + lit, free, rtol=0.02)
     assert dark.max() < 0.85 * free.min()
@@ -104,9 +115,50 @@ def test_mirror_clue_is_the_pattern_where_the_pixel_looks():
     pattern = np.zeros((32, 32, 3))
     pattern[:, :16, 0] = 1  # red at -x
     pattern[:, 16:, 1] = 1
-    image = clues.plane_clues(make_scene(RIG, pattern, None), 16, 64)[..., :3]
+    image = clues.plane_clues(make_scene(RIG, pattern, None), 16, 64)[0][..., :3]
     assert np.all(image[4:12, 2, 0] > 3 * image[4:12, 2, 1])
     assert np.all(image[4:12, 13, 1] > 3 * image[4:12, 13, 0])
+
+
+def test_slope_clues_are_derivatives():
+    """Against a rough white plane that is tilted a little, lit by the room and the screen."""
+    env = scale_environment(procedural_environment(5, 32), 0.5)
+    lit = clues.light_inputs(RIG, block_pattern(64), 1.0, env, size=8)
+    scene = make_scene(RIG, block_pattern(64), env)
+    for k, slope in enumerate(((0.02, 0.0), (0.0, 0.02))):
+        ends = []
+        for sign in (-1, 1):
+            normal = np.array([sign * slope[0], sign * slope[1], 1.0])
+            maps = constant_maps(8, 8, 0.6, 0.0, 0.6, normal / np.linalg.norm(normal))
+            ends.append(radiance_of(scene, maps))
+        difference = ((ends[1] - ends[0]) / 0.04).transpose(2, 0, 1)
+        clue = lit["slope_clues"][9 * k : 9 * k + 3]
+        assert np.abs(clue - difference).max() < 0.03 * np.abs(difference).max()
+
+
+def test_slopes_are_found_in_coloured_shading():
+    """Random slopes under known derivatives, with and without grey texture on top."""
+    torch.manual_seed(0)
+    g_p, g_q = 2 * torch.randn(2, 1, 3, 64, 64)
+    slope = 0.2 * torch.randn(1, 2, 64, 64)
+    detail = g_p * slope[:, :1] + g_q * slope[:, 1:]
+    found = slopes.posterior(detail, g_p, g_q, 0.05, 0.03)
+    assert (found - slope).std() < 0.15 * slope.std()
+    textured = detail + 0.3 * torch.randn(1, 1, 64, 64)
+    plain = slopes.posterior(textured, g_p, g_q, 0.05, 0.03)
+    aware = slopes.posterior(textured, g_p, g_q, 0.3, 0.03)
+    assert (aware - slope).std() < 0.5 * (plain - slope).std()
+
+
+def test_slope_posterior_is_the_formula():
+    d, g_p, g_q = torch.randn(3, 1, 3, 4, 4, dtype=torch.float64)
+    g = torch.stack([g_p, g_q], -1).permute(0, 2, 3, 1, 4)
+    prior, noise = slopes.SLOPE**2, 0.03**2 + slopes.NOISE**2
+    spread = prior * g @ g.mT + 0.3**2 * torch.ones(3, 3) + noise * torch.eye(3)
+    dense = prior * g.mT @ torch.linalg.solve(spread, d.permute(0, 2, 3, 1)[..., None])
+    torch.testing.assert_close(
+        slopes.posterior(d, g_p, g_q, 0.3, 0.03), dense[..., 0].permute(0, 3, 1, 2)
+    )
 
 
 def test_six_materials_from_four():
@@ -148,7 +200,7 @@ def test_split_sum_resembles_the_exact_light():
     lit = clues.light_inputs(RIG, block_pattern(64), 1.0, None)
     stack = splitsum.prefilter_sky(env, (*clues.ROUGHNESS, None))
     lit["sky"] = np.concatenate(list(stack), -1).transpose(2, 0, 1)
-    exact = clues.plane_clues(make_scene(RIG, None, env), 12, 64).transpose(2, 0, 1)
+    exact = clues.plane_clues(make_scene(RIG, None, env), 12, 64)[0].transpose(2, 0, 1)
     b = make_batch(lit, 12, 12)
     up = torch.zeros(1, 3, 12, 12)
     up[:, 2] = 1
