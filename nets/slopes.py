@@ -7,8 +7,8 @@ With n ∝ (p, q, 1) and the clue image B of a flat basis material, per colour c
 
 where a is grey variation of the albedo and c its variation in colour. Under light of many colours
 from many places g differs between channels, and the posterior mean of (p, q) under Gaussian priors
-is a 3 × 3 solve: photometric stereo with lights told apart by colour. The network learns which basis
-material, and how much of it, to believe.
+is a small linear solve: photometric stereo with lights told apart by colour. The network learns
+which basis material, and how much of it, to believe.
 """
 
 from __future__ import annotations
