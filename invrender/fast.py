@@ -1,9 +1,9 @@
 """The fast estimator: few filtered samples, no noise in the diffuse term.
 
 Diffuse light comes from tables of irradiance; specular light from visible-normal samples whose
-look-ups are filtered to each sample's share of the lobe; lamps are summed one by one where lobes
-are wider than they are. Everything is smooth in the maps and the pose: the screen's edge is as soft
-as the sample's footprint. The bias is that of the footprints and falls as samples grow.
+look-ups are filtered to each sample's share of the lobe; lamps are summed one by one. The screen's
+edge is as soft as the sample's footprint, so that pose and maps have gradients without edges. The
+bias is that of the footprints and falls as samples grow.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from typing import Any
 from invrender import brdf
 from invrender.backend import dr, vector
 from invrender.irradiance import screen_cell
-from invrender.lamps import LAMP_SIDES
-from invrender.pyramid import disc, disc_level, square_level
+from invrender.lamps import LAMP_SIDES, MAX_HOT
+from invrender.pyramid import disc, disc_direction, disc_level, square_level
 from invrender.scene import Scene, ScreenFrame, View, screen_frame, unit
 from invrender.shading import Shading, Sums, with_tangents
 from invrender.tables import Tables
 
 SCREEN_BIAS, SKY_BIAS = 0.0, -0.5  # levels added to a look-up whose footprint is a sample's share
+LAMP_SAMPLES = 256  # at least so many where a narrow lobe meets a lamp
 STEEP_SIDE = 16  # screen cells a side where a normal's horizon cuts the screen
-WIDE = 0.05  # a sample's share of the lobe, in texels, from which lamps are summed one by one
 
 
 def shade_fast(
@@ -36,17 +36,6 @@ def shade_fast(
     width = max(dr.width(view.x), dr.width(rho), dr.width(normal))
     sums = Sums(vec3, width, jacobian)
     screen = screen_frame(scene, view.x) if tables.screen is not None else None
-    s, t = brdf.frame(normal)
-
-    def along_normal(light: Any, d: Any, sign: int = 1) -> list[list[Any]]:
-        """Rows of light · max(±n·d, 0)."""
-        cos = sign * dr.dot(normal, d)
-        rows = [light * dr.maximum(cos, 0)]
-        if jacobian:
-            light = light * dr.select(cos > 0, scalar(sign), 0)
-            rows += [vec3(0), light * dr.dot(s, d), light * dr.dot(t, d)]
-        return [[r] for r in rows]
-
     sums.add(sums.derive(lambda _, n: (_smooth_irradiance(tables, view, n),), rho, normal), (0,))
     if screen is not None:
         side = STEEP_SIDE * tables.detail
@@ -54,57 +43,24 @@ def shade_fast(
 
         def steep(i: Any) -> list[list[Any]]:
             d, omega, light = screen_cell(scene, tables.screen, tables.sky, view.x, i, side)
-            return along_normal(light * omega, d, -1)
+            return _along_normal(sums, normal, light * omega, d, -1)
 
         sums.run(dr.detach(cells), steep, (0,), "steep")
 
     n_samples = dr.opaque(uint, samples)
-    wide = None
-    lamps = tables.lamps
-    if lamps is not None:
-        texel = dr.pi / scene.env_height
-        alpha = dr.detach(rho * rho)
-        wide = alpha * alpha * (4 * dr.pi) > scalar(n_samples) * (WIDE * texel * texel)
-        count = dr.opaque(uint, lamps.count)
-        # Points a side in a lamp near the lobe's core: more where that is the narrower one.
-        most = uint(1) + uint(alpha < 2.5 * texel) + uint(alpha < 0.8 * texel)
-        most = most + uint(alpha < 0.4 * texel)
-        core = dr.square(3 * alpha) + dr.square(0.75 * texel)
-        mirror = dr.detach(view.to_camera)
-
-        def side_of(lamp: Any) -> Any:
-            d = lamps.at(None, lamp)[0]
-            h = dr.normalize(d + mirror)
-            return dr.select(1 - dr.square(dr.dot(h, dr.detach(normal))) < core, most, 1)
-
-        def lamp_irradiance(i: Any) -> list[list[Any]]:
-            d, light = lamps.at(screen, i)
-            return along_normal(light, d)
-
-        def lamp_lobe(i: Any) -> list[list[Any]]:
-            lamp = i // LAMP_SIDES**2
-            d, light = lamps.at(screen, lamp, i - lamp * LAMP_SIDES**2, side_of(lamp))
-            rows = sums.derive(lambda r, n: _lobe(view, r * r, n, d), rho, normal)
-            return [[light * x for x in row] for row in rows]
-
-        def following(i: Any) -> Any:
-            lamp = i // LAMP_SIDES**2
-            last = i - lamp * LAMP_SIDES**2 + 1 >= dr.square(side_of(lamp))
-            return dr.select(last, (lamp + 1) * LAMP_SIDES**2, i + 1)
-
-        sums.run(count, lamp_irradiance, (0,), "lamp irradiance")
-        stop = dr.select(wide, count * LAMP_SIDES**2, 0)
-        sums.run(stop, lamp_lobe, (1, 2), "lamp lobes", following=following)
+    inv_n = 1 / scalar(n_samples)
+    if tables.lamps is not None:
+        most = dr.maximum(n_samples, LAMP_SAMPLES)
+        _add_lamps(sums, tables, screen, view, rho, normal, most)
     if tables.screen is not None or tables.sky is not None:
-        inv_n = 1 / scalar(n_samples)
 
         def specular(i: Any) -> list[list[Any]]:
             f = lambda r, n: _sample(tables, screen, view, i, inv_n, r * r, n).flat()  # noqa: E731
             if not jacobian:
-                return [_specular(tables, _Sample.of(tables, f(rho, normal)), wide)]
+                return [_specular(tables, _Sample.of(tables, f(rho, normal)))]
             values, tangents = with_tangents(f, rho, normal)
             return _specular_rows(
-                tables, _Sample.of(tables, values), [_Sample.of(tables, t) for t in tangents], wide
+                tables, _Sample.of(tables, values), [_Sample.of(tables, t) for t in tangents]
             )
 
         sums.run(n_samples, specular, (1, 2), "specular", inv_n)
@@ -112,6 +68,98 @@ def shade_fast(
     # The sky behind the screen is subtracted: where that is nearly all of it, rounding may show.
     shading.irradiance = dr.maximum(shading.irradiance, 0)
     return shading
+
+
+def _along_normal(sums: Sums, n: Any, light: Any, d: Any, sign: int = 1) -> list[list[Any]]:
+    """Rows of light · max(±n·d, 0)."""
+    cos = sign * dr.dot(n, d)
+    rows = [light * dr.maximum(cos, 0)]
+    if sums.jacobian:
+        s, t = brdf.frame(n)
+        light = light * dr.select(cos > 0, type(cos)(sign), 0)
+        rows += [type(light)(0), light * dr.dot(s, d), light * dr.dot(t, d)]
+    return [[r] for r in rows]
+
+
+def _add_lamps(
+    sums: Sums,
+    tables: Tables,
+    screen: ScreenFrame | None,
+    view: View,
+    rho: Any,
+    normal: Any,
+    samples: Any,
+) -> None:
+    """Lamps one by one, by Gauss's rule or, close to a narrow lobe's core, by its samples."""
+    lamps = tables.lamps
+    assert lamps is not None
+    uint = type(samples)
+    word = dr.uint64_array_t(uint)
+    count = dr.opaque(uint, lamps.count)
+    alpha, core, viewer = dr.detach((rho * rho, normal, view.to_camera))
+    side_of = lambda lamp: lamps.points_a_side(lamp, viewer, core, alpha, samples)  # noqa: E731
+
+    def irradiance(i: Any) -> list[list[Any]]:
+        d, light = lamps.at(screen, i)
+        return _along_normal(sums, normal, light, d)
+
+    sums.run(count, irradiance, (0,), "lamp irradiance")
+
+    points = LAMP_SIDES**2
+
+    def lobe(i: Any) -> list[list[Any]]:
+        lamp = i // points
+        side = side_of(lamp)
+        d, light = lamps.at(screen, lamp, i - lamp * points, dr.maximum(side, 1))
+        light = dr.select(side > 0, light, 0)
+        rows = sums.derive(lambda r, n: _lobe(view, r * r, n, d), rho, normal)
+        return [[light * x for x in row] for row in rows]
+
+    def next_point(i: Any) -> Any:
+        lamp = i // points
+        last = i - lamp * points + 1 >= dr.square(side_of(lamp))
+        return dr.select(last, (lamp + 1) * points, i + 1)
+
+    sums.run(count * points, lobe, (1, 2), "lamp lobes", following=next_point)
+
+    def mark(lamp: Any, near: Any) -> tuple[Any, Any]:
+        bit = word(1) << word(lamp)
+        return lamp + 1, near | dr.select(side_of(lamp) == 0, bit, 0)
+
+    narrow = dr.select(lamps.may_need_samples(alpha, samples), count, 0)
+    _, near = dr.while_loop(
+        (dr.zeros(uint, sums.width), dr.zeros(word, sums.width)),
+        lambda lamp, _: lamp < narrow,
+        mark,
+        label="lamps in the lobe's core",
+    )
+    inv_n = 1 / type(alpha)(samples)
+
+    def lamp_after(lamp: Any) -> Any:
+        """The next marked lamp from this one on, 64 if there is none."""
+        return uint(dr.tzcnt(dr.select(lamp < MAX_HOT, near & ~((word(1) << word(lamp)) - 1), 0)))
+
+    def image(i: Any) -> list[list[Any]]:
+        lamp = i // samples
+
+        def terms(r: Any, n: Any) -> tuple[Any, Any]:
+            sample = _sample(tables, screen, view, i - lamp * samples, inv_n, r * r, n)
+            x, y, _ = sample.sky
+            d = disc_direction(2 * x - 1, 1 - 2 * y, type(normal))
+            light = lamps.tent(lamp, d) * dr.select(d.z > 0, sample.weight, 0)
+            if tables.screen is not None and lamps.open < lamps.count:
+                light = light * (1 - tables.screen(*sample.screen).w)
+            return light * (1 - sample.fresnel), light * sample.fresnel
+
+        return sums.derive(terms, rho, normal)
+
+    def next_sample(i: Any) -> Any:
+        lamp = i // samples
+        last = i - lamp * samples + 1 >= samples
+        return dr.select(last, lamp_after(lamp + 1) * samples, i + 1)
+
+    first, stop = lamp_after(uint(0)) * samples, MAX_HOT * samples
+    sums.run(stop, image, (1, 2), "lamp images", inv_n, next_sample, first)
 
 
 @dataclass
@@ -189,20 +237,11 @@ def _sample(
 MIN_COVER = 0.02  # of a sky footprint that the screen does not always hide
 
 
-def _base(tables: Tables, wide: Any) -> Any:
-    """Where the sky pyramid starts: with lamps for narrow lobes, without for wide ones."""
-    assert tables.sky is not None
-    if wide is None:
-        return 0
-    uint = dr.uint32_array_t(tables.scene.scalar)
-    return dr.select(wide, uint(0), uint(tables.sky.size))
-
-
 def _rgb(v: Any) -> Any:
     return vector(type(v.x), 3)(v.x, v.y, v.z)
 
 
-def _specular(tables: Tables, sample: _Sample, wide: Any) -> list[Any]:
+def _specular(tables: Tables, sample: _Sample) -> list[Any]:
     """Terms of B and A."""
     light: Any = 0
     share: Any = 1
@@ -211,15 +250,13 @@ def _specular(tables: Tables, sample: _Sample, wide: Any) -> list[Any]:
         light, share = _rgb(rgba), 1 - rgba.w
     if tables.sky is not None:
         x, y, level = sample.sky
-        rgba = tables.sky(x, y, level, _base(tables, wide))
+        rgba = tables.sky(x, y, level)
         light = light + _rgb(rgba) * (share / dr.maximum(rgba.w, MIN_COVER))
     light = light * sample.weight
     return [light * (1 - sample.fresnel), light * sample.fresnel]
 
 
-def _specular_rows(
-    tables: Tables, sample: _Sample, tangents: list[_Sample], wide: Any
-) -> list[list[Any]]:
+def _specular_rows(tables: Tables, sample: _Sample, tangents: list[_Sample]) -> list[list[Any]]:
     """`_specular` and its tangents by the chain rule: one set of texels serves all of them."""
 
     def chain(slopes: list[Any], t: list[Any]) -> Any:
@@ -237,7 +274,7 @@ def _specular_rows(
             d_light[k], d_share[k] = _rgb(d), -d.w
     if tables.sky is not None:
         x, y, level = sample.sky
-        rgba, *slopes = tables.sky.slopes(x, y, level, _base(tables, wide))
+        rgba, *slopes = tables.sky.slopes(x, y, level)
         inverse = 1 / dr.maximum(rgba.w, MIN_COVER)
         sky, share = _rgb(rgba), share * inverse
         light = light + sky * share

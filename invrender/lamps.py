@@ -1,7 +1,8 @@
 """Lamps: the few brightest texels of an environment, summed one by one.
 
-A lamp is a texel's bilinear tent. It is a few points of Gauss's rule, and the screen's edge covers
-each of them bit by bit.
+A lamp is a texel's bilinear tent. For what varies slowly over it, diffuse light and lobes that are
+wide or far away, it is a few points of Gauss's rule, and the screen's edge covers each of them bit
+by bit. In a narrow lobe close to its mirror image it is read where the lobe's samples meet it.
 """
 
 from __future__ import annotations
@@ -12,24 +13,29 @@ from typing import Any
 import numpy as np
 
 from invrender.backend import dr, vector
-from invrender.scene import Scene, ScreenFrame, hit_screen
+from invrender.scene import Scene, ScreenFrame, aligned, equirect_uv, hit_screen
 
 HOT_SHARE = 0.004  # a texel whose flux exceeds this share of the environment's is a lamp of its own
-MAX_HOT = 64
-LAMP_SIDES = 4  # at most so many points a side in a lamp, more of them as samples grow
+MAX_HOT = 64  # as many as a word has bits
+MIN_COS = 0.3  # of the angle of incidence, where the width of a lamp in half vectors is bounded
+LAMP_SIDES = 4  # at most so many points a side in a lamp
 
 
 @dataclass
 class Lamps:
-    """Points, radiance (flat RGB) and number of the lamps that the screen does not always hide.
+    """Points, texels, radiance (flat RGB) and number of the lamps that the screen does not always
+    hide.
 
-    The first ``open`` of them are hidden from no part of the sample.
+    texels: row and column of each in an environment of ``height`` rows. The first ``open`` lamps
+    are hidden from no part of the sample.
     """
 
     points: Any
+    texels: Any
     radiance: Any
     count: int
     open: int
+    height: int
 
     def at(
         self, screen: ScreenFrame | None, lamp: Any, k: Any = 0, side: Any = 1
@@ -64,6 +70,55 @@ class Lamps:
         covered = inside(ps, screen.along_s) * inside(pt, screen.along_t)
         return d, light * (1 - dr.select(ahead, covered, 0))
 
+    def points_a_side(self, lamp: Any, to_camera: Any, normal: Any, alpha: Any, n: Any) -> Any:
+        """Points a side for the integral of a lobe over a lamp, 0 for the lobe's own n samples.
+
+        Gauss's rule with k points errs by ρ^-2k where the lobe's poles, at tan θ_h = iα, lie on the
+        ellipse about the lamp whose foci are its edges and whose axes, in half-widths of the lamp,
+        add up to 2ρ. It is to err by less than 1/n.
+        """
+        uint = dr.uint32_array_t(type(alpha))
+        d, _ = self.at(None, lamp)
+        h = dr.normalize(d + to_camera)
+        width = self._half_width(dr.dot(h, to_camera))
+        cos = dr.dot(h, normal)
+        x, y2 = dr.safe_sqrt(1 - cos * cos) / width, dr.square(alpha / width)
+        to_foci = dr.sqrt(dr.fma(x - 1, x - 1, y2)) + dr.sqrt(dr.fma(x + 1, x + 1, y2))
+        side = uint(1)
+        for k in range(1, LAMP_SIDES + 1):
+            more = k + 1 if k < LAMP_SIDES else 0
+            side = dr.select(to_foci < _foci_sum(n, k, type(alpha)), more, side)
+        # Two or three points cover a lamp in steps that the screen's edge shows.
+        cut = lamp >= dr.opaque(uint, self.open)
+        return dr.select(cut & (side > 1), LAMP_SIDES, side)
+
+    def may_need_samples(self, alpha: Any, n: Any) -> Any:
+        """Whether `points_a_side` can be 0: only for a narrow lobe."""
+        y2 = dr.square(alpha / self._half_width(type(alpha)(MIN_COS)))
+        return 2 * dr.sqrt(1 + y2) < _foci_sum(n, LAMP_SIDES, type(alpha))
+
+    def _half_width(self, cos: Any) -> Any:
+        """Of a lamp as half vectors see it, radians; cos: of the angle of incidence on them."""
+        return (0.5 * dr.pi / self.height) / dr.maximum(cos, MIN_COS)
+
+    def tent(self, lamp: Any, d: Any) -> Any:
+        """Radiance of a lamp along unit directions d."""
+        scalar, uint = type(self.points), type(lamp)
+        u, v = equirect_uv(d)
+        row = dr.gather(scalar, self.texels, 2 * lamp)
+        column = dr.gather(scalar, self.texels, 2 * lamp + 1)
+        y = dr.abs(dr.clip(v * self.height - 0.5, 0, self.height - 1) - row)
+        x = dr.abs(u * (2 * self.height) - 0.5 - column)
+        x = dr.minimum(x, 2 * self.height - x)
+        weight = dr.maximum(1 - x, 0) * dr.maximum(1 - y, 0)
+        return dr.gather(vector(scalar, 3), self.radiance, uint(lamp)) * weight
+
+
+def _foci_sum(n: Any, k: int, scalar: type) -> Any:
+    """ρ + 1/ρ of the ellipse where Gauss's rule with k points errs by 1/n."""
+    rho = scalar(n) ** (0.5 / k)
+    return rho + 1 / rho
+
 
 def split_lamps(scene: Scene) -> tuple[Lamps | None, Any]:
     """(lamps, what is left of the environment when they are taken out).
@@ -87,19 +142,22 @@ def split_lamps(scene: Scene) -> tuple[Lamps | None, Any]:
         return None, scene.environment
     keep = np.ones(h * w)
     keep[hot] = limit / flux.ravel()[hot]
-    rest = scene.environment * scalar(np.repeat(keep, 3))
+    rest = scene.environment * scalar(aligned(np.repeat(keep, 3), scalar))
     theta, phi = (hot // w + 0.5) * np.pi / h, (hot % w + 0.5) * np.pi / h
-    d = vec3(np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta))
+    directions = [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)]
+    d = vec3(*(scalar(aligned(c, scalar)) for c in directions))
     hidden, partly = (
         np.broadcast_to(np.array(m), len(hot)) for m in corner_hits(dr.detach(scene), d, np.pi / h)
     )
     hot = np.concatenate([hot[~partly], hot[partly & ~hidden]])
     if not len(hot):
         return None, rest
-    lamp = dr.gather(vec3, scene.environment, uint(hot.astype(np.uint32)))
-    radiance = dr.ravel(lamp * (1 - scalar(keep[hot])) * scene.scale)
-    points = scalar(_points(hot, h))
-    return Lamps(points, radiance, len(hot), int((~partly).sum())), rest
+    flat = (3 * hot[:, None] + np.arange(3)).ravel()
+    radiance = dr.gather(scalar, scene.environment, uint(aligned(flat, uint))) * scene.scale
+    radiance = radiance * scalar(aligned(1 - np.repeat(keep[hot], 3), scalar))
+    points = scalar(aligned(_points(hot, h), scalar))
+    texels = scalar(aligned(np.stack([hot // w, hot % w], -1).ravel(), scalar))
+    return Lamps(points, texels, radiance, len(hot), int((~partly).sum()), h), rest
 
 
 def corner_hits(scene: Scene, d: Any, margin: float) -> tuple[Any, Any]:

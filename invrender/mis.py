@@ -14,6 +14,7 @@ from invrender.backend import dr, vector
 from invrender.scene import (
     Scene,
     View,
+    aligned,
     environment_at,
     equirect_uv,
     hash_bits,
@@ -53,12 +54,8 @@ class EnvironmentSampler:
         weight /= weight.sum()
         rows = weight.sum(1)
         columns = np.cumsum(weight, 1) / np.maximum(rows, 1e-300)[:, None]
-        return EnvironmentSampler(
-            scalar(np.cumsum(rows)),
-            scalar(columns.ravel()),
-            scalar((weight * 2 * h * h).ravel()),
-            h,
-        )
+        flat = lambda a: scalar(aligned(a.ravel(), scalar))  # noqa: E731
+        return EnvironmentSampler(flat(rows.cumsum()), flat(columns), flat(weight * 2 * h * h), h)
 
     def sample(self, u1: Any, u2: Any) -> tuple[Any, Any]:
         """(unit direction, density in 1/sr) for uniform (u1, u2)."""

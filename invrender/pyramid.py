@@ -45,12 +45,7 @@ class Pyramid:
             a, b, c, d = (dr.gather(vec4, flat, j + k) for k in (0, 1, 2 * m, 2 * m + 1))
             image = 0.25 * (a + b + c + d)
 
-    @property
-    def size(self) -> int:
-        """Texels of all levels."""
-        return level_offset(self.n, self.n.bit_length())
-
-    def _level(self, k: Any, x: Any, y: Any, slopes: bool, base: Any) -> list[Any]:
+    def _level(self, k: Any, x: Any, y: Any, slopes: bool) -> list[Any]:
         """[value] on level k, or [value, ∂/∂x, ∂/∂y]."""
         scalar = type(x)
         uint = dr.uint32_array_t(scalar)
@@ -62,7 +57,7 @@ class Pyramid:
         ix, iy = dr.minimum(uint(qx), m), dr.minimum(uint(qy), m)
         fx, fy = qx - scalar(ix), qy - scalar(iy)
         width = m + 2
-        i = level_offset(self.n, k) + base + iy * width + ix
+        i = level_offset(self.n, k) + iy * width + ix
         a, b, c, d = (dr.gather(vec4, self.texels, i + j) for j in (0, 1, width, width + 1))
         upper, lower = dr.fma(b - a, fx, a), dr.fma(d - c, fx, c)
         value = dr.fma(lower - upper, fy, upper)
@@ -71,30 +66,27 @@ class Pyramid:
         in_x, in_y = dr.select(qx == px, mf, 0), dr.select(qy == py, mf, 0)
         return [value, dr.lerp(b - a, d - c, fy) * in_x, (lower - upper) * in_y]
 
-    def _trilinear(self, x: Any, y: Any, level: Any, slopes: bool, base: Any) -> list[Any]:
+    def _trilinear(self, x: Any, y: Any, level: Any, slopes: bool) -> list[Any]:
         scalar = type(x)
         uint = dr.uint32_array_t(scalar)
         top = self.n.bit_length() - 1
         clipped = dr.clip(level, 0, top)
         k = dr.minimum(uint(clipped), max(top - 1, 0))
         f = clipped - scalar(k)
-        fine = self._level(k, x, y, slopes, base)
-        coarse = self._level(k + min(top, 1), x, y, slopes, base)
+        fine = self._level(k, x, y, slopes)
+        coarse = self._level(k + min(top, 1), x, y, slopes)
         out = [dr.fma(q - p, f, p) for p, q in zip(fine, coarse, strict=True)]
         if slopes:
             out.append(dr.select(clipped == level, coarse[0] - fine[0], 0))
         return out
 
-    def __call__(self, x: Any, y: Any, level: Any, base: Any = 0) -> Any:
-        """RGBA at (x, y) in [0, 1]², row 0 at y = 0, trilinear in the level.
+    def __call__(self, x: Any, y: Any, level: Any) -> Any:
+        """RGBA at (x, y) in [0, 1]², row 0 at y = 0, trilinear in the level."""
+        return self._trilinear(x, y, level, False)[0]
 
-        ``base``: where the texels of this pyramid begin, if others are stored before it.
-        """
-        return self._trilinear(x, y, level, False, base)[0]
-
-    def slopes(self, x: Any, y: Any, level: Any, base: Any = 0) -> list[Any]:
+    def slopes(self, x: Any, y: Any, level: Any) -> list[Any]:
         """[RGBA, ∂/∂x, ∂/∂y, ∂/∂level] at (x, y, level)."""
-        return self._trilinear(x, y, level, True, base)
+        return self._trilinear(x, y, level, True)
 
 
 def level_offset(n: int, k: Any) -> Any:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from invrender import brdf
-from invrender.backend import Float, ad, dr, vector
+from invrender.backend import Float, dr, vector
 from invrender.fast import shade_fast
 from invrender.maps import Maps
 from invrender.mis import EnvironmentSampler, shade_mis
@@ -240,7 +240,7 @@ def material_from_maps(
         flat = image.reshape(-1, image.shape[2] if image.ndim == 3 else 1)[start:stop]
         if len(flat) > 1 and np.all(flat == flat[0]):
             flat = flat[:1]
-        return aligned(flat.T.astype(np.float64 if scalar is ad.Float64 else np.float32))
+        return aligned(flat.T, scalar)
 
     return Material(
         vec3(rows(maps.diffuse)),

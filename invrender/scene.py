@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from invrender.backend import Float, dr, vector
+from invrender.backend import Float, ad, dr, vector
 from invrender.errors import InputError
 from invrender.rig import Rig
 
@@ -66,7 +66,7 @@ def make_scene(
             raise InputError(f"{name} must be (H, {aspect}H, 3), got {image.shape}")
         if not np.all(np.isfinite(image)) or image.min() < 0:
             raise InputError(f"{name} has negative or non-finite values")
-        return scalar(image.ravel().astype(np.float64)), image.shape[0]
+        return scalar(aligned(image.ravel(), scalar)), image.shape[0]
 
     flat_env, env_height = light(environment, "environment", 2)
     if environment is not None and not np.any(environment):
@@ -187,12 +187,14 @@ def hit_screen(scene: Scene, x: Any, d: Any) -> tuple[Any, Any, Any, Any, Any]:
     return s, t, r, cos, ahead & (s >= 0) & (s < 1) & (t >= 0) & (t < 1)
 
 
-def aligned(array: np.ndarray) -> np.ndarray:
-    """A copy at a 64-byte boundary.
+def aligned(array: np.ndarray, kind: type) -> np.ndarray:
+    """A copy at a 64-byte boundary, in the precision of the Dr.Jit array type ``kind``.
 
     Dr.Jit takes numpy memory as it is and compiles its alignment into kernels: left to chance,
     the same call would now and then compile anew.
     """
+    floats = np.float64 if kind is ad.Float64 else np.float32
+    array = array.astype(np.uint32 if dr.is_integral_v(kind) else floats)
     buffer = np.empty(array.nbytes + 64, np.uint8)
     start = -buffer.ctypes.data % 64
     out = buffer[start : start + array.nbytes].view(array.dtype).reshape(array.shape)

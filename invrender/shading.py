@@ -80,8 +80,12 @@ class Sums:
         label: str,
         factor: Any = 1,
         following: Callable[[Any], Any] = lambda i: i + 1,
+        first: Any = 0,
     ) -> None:
-        """Add factor · rows(i) for i = 0, following(0), ... below count, which differs by pixel."""
+        """Add factor · rows(i) for i = first, following(first), ... below count.
+
+        first and count may differ by pixel.
+        """
         uint = type(count)
 
         def body(i: Any, *sums: Any) -> tuple[Any, ...]:
@@ -91,7 +95,7 @@ class Sums:
         step = len(targets)
         zero = dr.zeros(type(self.rows[0][0]), self.width)
         out = dr.while_loop(
-            (dr.zeros(uint, self.width), *(zero for _ in range(step * len(self.rows)))),
+            (first + dr.zeros(uint, self.width), *(zero for _ in range(step * len(self.rows)))),
             lambda i, *_: i < count,
             body,
             max_iterations=-1,

@@ -24,9 +24,9 @@ class Tables:
     """What the fast estimator reads; rebuilt when the lights or the screen's pose change.
 
     screen: RGBA pyramid of gain × pattern. sky: RGBA pyramid of the environment above the table on
-    Lambert's disc, without its lamps and what the screen hides from the whole sample (A = 0 there);
-    where there are lamps, a second one that holds them follows it. ``detail`` multiplies the sizes
-    of all tables: the estimator's bias goes to zero as both it and the samples grow.
+    Lambert's disc, without its lamps and what the screen hides from the whole sample (A = 0 there).
+    ``detail`` multiplies the sizes of all tables: the estimator's bias goes to zero as both it and
+    the samples grow.
     """
 
     scene: Scene
@@ -48,7 +48,7 @@ def fast_tables(scene: Scene, detail: int = 1) -> Tables:
         screen = _screen_pyramid(scene, detail)
     if scene.environment is not None:
         lamps, rest = split_lamps(scene)
-        sky = _sky_pyramid(scene, rest, lamps is not None, detail)
+        sky = _sky_pyramid(replace(scene, environment=rest), detail)
         irradiance = SkyIrradiance.build(sky, scene.scalar, detail)
     if screen is not None:
         added = VectorIrradiance.build(scene, screen, sky, detail)
@@ -74,8 +74,7 @@ def _screen_pyramid(scene: Scene, detail: int) -> Pyramid:
     return Pyramid.build(vector(scalar, 4)(rgb.x, rgb.y, rgb.z, 1), n)
 
 
-def _sky_pyramid(scene: Scene, rest: Any, has_lamps: bool, detail: int) -> Pyramid:
-    """The pyramid of the environment ``rest`` and, where there are lamps, that of all of it."""
+def _sky_pyramid(scene: Scene, detail: int) -> Pyramid:
     scalar = scene.scalar
     uint, vec3, vec4 = dr.uint32_array_t(scalar), vector(scalar, 3), vector(scalar, 4)
     least, most = SKY_RANGE
@@ -85,13 +84,7 @@ def _sky_pyramid(scene: Scene, rest: Any, has_lamps: bool, detail: int) -> Pyram
     inside = px * px + py * py < 1
     d = disc_direction(dr.select(inside, px, 0), dr.select(inside, py, 0), vec3)
     hidden, _ = corner_hits(dr.detach(scene), d, 0)
-
-    def image(lit: Scene) -> Any:
-        seen = dr.select(inside & ~hidden, environment_at(lit, d), 0)
-        return vec4(seen.x, seen.y, seen.z, dr.select(inside & hidden, scalar(0), 1))
-
-    without = replace(scene, environment=rest)
-    images = [image(s) for s in ((without, scene) if has_lamps else (without,))]
-    dr.eval(images)
-    pyramids = [Pyramid.build(i, n).texels for i in images]
-    return Pyramid(dr.concat(pyramids) if has_lamps else pyramids[0], n)
+    seen = dr.select(inside & ~hidden, environment_at(scene, d), 0)
+    image = vec4(seen.x, seen.y, seen.z, dr.select(inside & hidden, scalar(0), 1))
+    dr.eval(image)
+    return Pyramid.build(image, n)
