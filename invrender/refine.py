@@ -42,6 +42,7 @@ SHARE = np.array([1] * 6 + [0] + [0.2] * 2, np.float32)  # of its step that each
 LIGHT_NOISE = (0.1, 0.05)  # as PHOTO_NOISE, for what the lights' estimate adds to it
 UNLIKELY = 1.0  # mean squared residual, in its expected spread, from which a pixel counts less
 STOP = 0.02  # relative decrease of the mean cost below which steps end
+ROUNDING = 1e-5  # of the prior variance: what single precision can tell of the rest
 
 
 @dataclass
@@ -226,7 +227,7 @@ def refine(
             old[better] = fresh[better]
         length = np.where(better, np.minimum(2 * length, 1), length / 4)
         left = 1 - np.einsum("hwpc,hwcp->hwp", gain, ac)
-        result.sigma = sigma * np.sqrt(np.clip(left, 0, 1))
+        result.sigma = sigma * np.sqrt(np.clip(left, ROUNDING, 1))
     result.maps = to_maps(theta)
     return result
 
