@@ -10,14 +10,15 @@ from __future__ import annotations
 import multiprocessing
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from queue import SimpleQueue
 from typing import Any
 
 from invrender.errors import InputError
 
 RETRIES = 10  # workers that may die over one item
-TASKS_PER_PROCESS = 16  # then it is replaced: Dr.Jit's caches grow with the kernels
 
 
 @dataclass(frozen=True)
@@ -41,13 +42,12 @@ def map_tasks(
     items: Sequence[Any],
     scheduler: str | None = None,
     workers: int = 1,
-    initializer: Callable[[], None] | None = None,
 ) -> Iterator[Done]:
     """Apply a function to every item; yields each item's `Done` as it comes, in any order.
 
     scheduler: the address of a Dask scheduler; needs the extra ``cluster``. Without one, a number
-    of ``workers`` other than 1 means that many processes, each started with ``initializer``. An
-    error of one item does not stop the others. Raises `InputError` if no scheduler answers.
+    of ``workers`` other than 1 means that many processes, and 1 this one. An error of one item does
+    not stop the others, nor does a process that dies. Raises `InputError` if no scheduler answers.
     """
     if scheduler:
         yield from _on_cluster(function, items, scheduler)
@@ -55,7 +55,7 @@ def map_tasks(
         for index, item in enumerate(items):
             yield _guarded(function, index, item)
     else:
-        yield from _in_processes(function, items, workers, initializer)
+        yield from _in_processes(function, items, workers)
 
 
 def _guarded(function: Callable[[Any], Any], index: int, item: Any) -> Done:
@@ -66,21 +66,36 @@ def _guarded(function: Callable[[Any], Any], index: int, item: Any) -> Done:
 
 
 def _in_processes(
-    function: Callable[[Any], Any],
-    items: Sequence[Any],
-    workers: int,
-    initializer: Callable[[], None] | None,
+    function: Callable[[Any], Any], items: Sequence[Any], workers: int
 ) -> Iterator[Done]:
+    # A pool a process: where one dies, only its own item is lost, and known.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(
-        workers, context, initializer, max_tasks_per_child=TASKS_PER_PROCESS
-    ) as pool:
-        jobs = [pool.submit(_guarded, function, i, item) for i, item in enumerate(items)]
+    idle: SimpleQueue[ProcessPoolExecutor] = SimpleQueue()
+    for _ in range(workers):
+        idle.put(ProcessPoolExecutor(1, context))
+
+    def run(index: int, item: Any) -> Done:
+        pool = idle.get()
+        try:
+            for _ in range(RETRIES + 1):
+                try:
+                    return pool.submit(_guarded, function, index, item).result()
+                except BrokenProcessPool as error:
+                    died = error
+                    pool = ProcessPoolExecutor(1, context)
+            return Done(index, error=died)
+        finally:
+            idle.put(pool)
+
+    with ThreadPoolExecutor(workers) as threads:
+        jobs = [threads.submit(run, i, item) for i, item in enumerate(items)]
         try:
             for job in as_completed(jobs):
                 yield job.result()
         finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+            threads.shutdown(cancel_futures=True)
+            for _ in range(workers):
+                idle.get().shutdown()
 
 
 def _on_cluster(
