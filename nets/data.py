@@ -3,8 +3,8 @@
     python -m nets.data --out DIR --count 4096 --materials DIR --envs DIR
 
 Shards of `SHARD` captures are files shard_NNNNNN.safetensors. Shard i depends on the options, the
-seed and i alone, and appears under its name only when whole: any engine may map `write_shard` over
-the indices, on any number of machines, and again over what is missing.
+seed and i alone, and appears under its name only when whole: the same command again makes what is
+missing. ``--scheduler`` runs it on a Dask cluster whose machines share the folders.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import json
 import logging
-import multiprocessing
 import os
 import time
 from collections.abc import Iterator
@@ -27,6 +26,7 @@ from safetensors.numpy import save_file
 from scipy.ndimage import gaussian_filter
 
 from invrender.backend import Float, dr, vector
+from invrender.cluster import map_tasks
 from invrender.environments import (
     find_environments,
     procedural_environment,
@@ -41,9 +41,9 @@ from invrender.materials import (
     augment,
     check_maps,
     find_materials,
+    load_materials,
     mix,
     procedural_material,
-    read_material,
 )
 from invrender.pattern import default_pattern
 from invrender.render import Material, prepare, radiance
@@ -110,18 +110,11 @@ def holdout_names() -> set[str]:
 @lru_cache(maxsize=4)
 def _folder_materials(root: str, split: str) -> tuple[Maps, ...]:
     """Usable materials of a folder that belong to a split, at most 512² each."""
-    held, out = holdout_names(), []
-    for folder in find_materials(Path(root)) if root else []:
-        if (folder.name in held) != (split == "holdout"):
-            continue
-        try:
-            maps = read_material(folder, 512)
-            check_maps(maps)
-        except (InputError, OSError) as e:
-            log.warning("%s left out: %s", folder, e)
-        else:
-            out.append(maps)
-    return tuple(out)
+    if not root:
+        return ()
+    held = holdout_names()
+    wanted = lambda folder: (folder.name in held) == (split == "holdout")  # noqa: E731
+    return tuple(maps for _, maps in load_materials(Path(root), 512, wanted))
 
 
 @lru_cache(maxsize=4)
@@ -132,8 +125,8 @@ def _folder_environments(root: str, split: str, height: int) -> tuple[Array, ...
             continue
         try:
             out.append(read_environment(path, height))
-        except (InputError, OSError) as e:
-            log.warning("%s left out: %s", path, e)
+        except (InputError, OSError, MemoryError) as e:
+            log.warning("%s left out: %s", path, e or type(e).__name__)
     return tuple(out)
 
 
@@ -311,6 +304,8 @@ def write_shard(folder: Path, index: int, options: Options, count: int = SHARD) 
 
 
 def _work(job: tuple[Path, int, Options, int]) -> tuple[int, float]:
+    """Write a shard on one thread: (its index, seconds)."""
+    _single_thread()
     start = time.perf_counter()
     write_shard(*job)
     return job[1], time.perf_counter() - start
@@ -323,32 +318,56 @@ def _single_thread() -> None:
     torch.set_num_threads(1)
 
 
-def main() -> None:
+def check_options(options: Options) -> None:
+    """Raise `InputError` for what no worker could use, before any starts."""
+    if min(options.size, options.samples, options.per_room) < 1 or options.env_height < 2:
+        raise InputError("sizes, samples and captures a room must be positive")
+    if not 0 <= options.procedural <= 1:
+        raise InputError("--procedural is a share between 0 and 1")
+    light_pattern(options.pattern)
+    if options.materials:
+        find_materials(Path(options.materials))
+    if options.envs:
+        find_environments(Path(options.envs))
+
+
+def main() -> int:
+    """Write what is missing; 1 where a shard failed, 2 for bad input."""
     parser = argparse.ArgumentParser(prog="python -m nets.data", description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--count", type=int, default=4096, help="captures")
     parser.add_argument("--first", type=int, default=0, help="index of the first shard")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes")
+    parser.add_argument("--scheduler", help="address of a Dask scheduler, instead of processes")
     for name, value in asdict(Options()).items():
         kind = {"choices": ("train", "holdout")} if name == "split" else {"type": type(value)}
         parser.add_argument(f"--{name.replace('_', '-')}", default=value, **kind)
     args = parser.parse_args()
     options = Options(**{k: getattr(args, k) for k in asdict(Options())})
-    args.out.mkdir(parents=True, exist_ok=True)
-    jobs = []
-    for i in range(-(-args.count // SHARD)):
-        count = min(SHARD, args.count - i * SHARD)
-        if not shard_path(args.out, args.first + i).exists():
-            jobs.append((args.out, args.first + i, options, count))
-    context = multiprocessing.get_context("spawn")
-    # A worker is replaced now and then: Dr.Jit's caches grow with the kernels.
-    start, done = time.perf_counter(), 0
-    with context.Pool(args.workers, _single_thread, maxtasksperchild=16) as pool:
-        for index, seconds in pool.imap_unordered(_work, jobs):
-            done += 1
-            rate = done * SHARD / (time.perf_counter() - start)
+    failed = 0
+    try:
+        check_options(options)
+        args.out.mkdir(parents=True, exist_ok=True)
+        counts = [min(SHARD, args.count - i) for i in range(0, args.count, SHARD)]
+        jobs = [(args.out.resolve(), args.first + i, options, n) for i, n in enumerate(counts)]
+        jobs = [job for job in jobs if not shard_path(*job[:2]).exists()]
+        start, made = time.perf_counter(), 0
+        for done in map_tasks(_work, jobs, args.scheduler, args.workers):
+            if done.error is not None:
+                failed += 1
+                print(f"shard {jobs[done.index][1]} failed: {done.error}\n{done.trace}", flush=True)
+                continue
+            index, seconds = done.result
+            made += jobs[done.index][3]
+            rate = made / (time.perf_counter() - start)
             print(f"shard {index}: {seconds:.1f} s; {rate:.2f} captures/s in all", flush=True)
+    except InputError as e:
+        print(f"error: {e}")
+        return 2
+    return 1 if failed else 0
 
 
 if __name__ == "__main__":
-    main()
+    from nets import data  # so that other processes find `_work` under this module's name
+
+    raise SystemExit(data.main())

@@ -9,6 +9,7 @@ torch = pytest.importorskip("torch")
 
 from safetensors.numpy import load_file, save_file  # noqa: E402
 
+from invrender.cluster import map_tasks  # noqa: E402
 from invrender.errors import InputError  # noqa: E402
 from invrender.images import write_exr  # noqa: E402
 from invrender.maps import constant_maps, write_maps  # noqa: E402
@@ -60,6 +61,73 @@ def test_what_is_there_is_not_made_again(folder):
     assert data.write_shard(folder, 0, OPTIONS, 6) == path
     assert path.stat().st_mtime_ns == before
     assert not list(folder.glob("*.part")) and not list(folder.glob(".*.part"))
+
+
+def command(monkeypatch, *words):
+    monkeypatch.setattr("sys.argv", ["data", *map(str, words)])
+    return data.main()
+
+
+SMALL = ("--size", 8, "--samples", 2, "--workers", 1)
+
+
+def test_command_makes_what_is_missing(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(data, "_single_thread", lambda: None)
+    monkeypatch.setattr(data, "SHARD", 2)
+    options = ("--out", tmp_path, "--count", 5, "--first", 3, *SMALL)
+    assert command(monkeypatch, *options) == 0
+    names = [f"shard_{i:06d}.safetensors" for i in (3, 4, 5)]
+    assert [p.name for p in shards(tmp_path)] == names
+    assert [len(load_file(p)["photo"]) for p in shards(tmp_path)] == [2, 2, 1]
+    before = [p.stat().st_mtime_ns for p in shards(tmp_path)]
+    whole = load_file(tmp_path / names[1])
+    (tmp_path / names[1]).unlink()
+    assert command(monkeypatch, *options) == 0
+    after = [p.stat().st_mtime_ns for p in shards(tmp_path)]
+    assert [a == b for a, b in zip(after, before, strict=True)] == [True, False, True]
+    again = load_file(tmp_path / names[1])
+    assert all(np.array_equal(again[k], whole[k]) for k in whole)
+    # A shard that cannot be written does not stop the others.
+    (tmp_path / names[0]).unlink()
+    write = data.write_shard
+    monkeypatch.setattr(data, "write_shard", lambda f, i, *a: write(f, i, *a) if i != 3 else 1 / 0)
+    capsys.readouterr()
+    assert command(monkeypatch, *options) == 1
+    assert "shard 3 failed: division by zero" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "words, why",
+    [
+        (("--materials", "nowhere"), "not a folder"),
+        (("--envs", "nowhere"), "no .exr or .hdr"),
+        (("--pattern", "nowhere.png"), "nowhere.png"),
+        (("--procedural", 2), "share"),
+        (("--size", 0), "positive"),
+    ],
+)
+def test_command_refuses_bad_input_before_it_starts(words, why, tmp_path, monkeypatch, capsys):
+    assert command(monkeypatch, "--out", tmp_path / "new", *SMALL, *words) == 2
+    assert why in capsys.readouterr().out and not (tmp_path / "new").exists()
+
+
+@pytest.mark.slow
+def test_a_cluster_loses_nothing_when_a_worker_dies(folder, tmp_path):
+    """Two Dask workers make shards, one is killed half-way: the same shards as in one process."""
+    distributed = pytest.importorskip("distributed")
+    jobs = [(tmp_path, i, OPTIONS, 6) for i in range(8)]
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None
+    ) as cluster:
+        seen = []
+        for done in map_tasks(data._work, jobs, scheduler=cluster.scheduler_address):
+            seen.append(done.unwrap()[0])
+            if len(seen) == 3:
+                next(iter(cluster.workers.values())).process.process.kill()
+    assert sorted(seen) == list(range(8)) and len(shards(tmp_path)) == 8
+    for mine, theirs in zip(shards(folder), shards(tmp_path), strict=False):
+        a, b = load_file(mine), load_file(theirs)
+        assert all(np.array_equal(a[k], b[k]) for k in a)
 
 
 def test_photo_is_the_ideal_one_but_for_display_and_sensor(folder):

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -225,12 +225,14 @@ def is_directx(normal: Array) -> bool:
     return handedness(normal) < -0.35
 
 
-def load_materials(root: Path, max_size: int = 4096) -> Iterator[tuple[Path, Maps]]:
-    """Every usable material below a folder, with its path.
+def load_materials(
+    root: Path, max_size: int = 4096, wanted: Callable[[Path], bool] = lambda folder: True
+) -> Iterator[tuple[Path, Maps]]:
+    """Every usable material below a folder whose own folder is ``wanted``, with its path.
 
     Broken, degenerate and unreadable ones are left out, each with one line in the log.
     """
-    for folder in find_materials(root):
+    for folder in filter(wanted, find_materials(root)):
         try:
             maps = read_material(folder, max_size)
             check_maps(maps)
