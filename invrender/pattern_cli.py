@@ -26,7 +26,7 @@ def add_parser(commands: Any) -> None:
     parser.add_argument(
         "--optimise",
         action="store_true",
-        help="search for the best pattern of a rig instead of taking the default (two minutes)",
+        help="search for the best pattern of a rig instead of taking the default (about a minute)",
     )
     parser.add_argument("--rig", type=Path, help="rig.toml of the rig to optimise for (default)")
     parser.add_argument("--seed", type=int, default=0, help="of the search (0)")
@@ -70,6 +70,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
             console.print(
                 f"  {name:>9}: expected error {parts}; criterion {errors['criterion']:.3f}",
                 highlight=False,
+                soft_wrap=True,
             )
         pattern = resize_pattern(found.pattern, args.size)
     else:

@@ -12,6 +12,7 @@ from scipy.optimize import minimize
 
 from invrender.design.criterion import Criterion
 from invrender.design.population import CELLS, draw_population, measure_responses
+from invrender.pattern import default_pattern, resize_pattern
 from invrender.rig import Rig
 
 Array = NDArray[np.floating[Any]]
@@ -106,9 +107,11 @@ def design(
     rooms: int = 12,
     progress: Callable[[float], None] | None = None,
 ) -> Design:
-    """Optimise a pattern for a rig from several starts; the best on a held-out population wins.
+    """Optimise a pattern for a rig, from the default one and from hue wheels; the best of them on a
+    held-out population wins.
 
-    compare: patterns (cells, cells, 3) to report beside it. progress: called with 0 to 1.
+    starts: how many. compare: patterns (cells, cells, 3) to report beside it. progress: called with
+    0 to 1.
     """
     tell = progress or (lambda _: None)
 
@@ -122,7 +125,9 @@ def design(
     rng = np.random.default_rng(seed)
     found = []
     for k in range(starts):
-        start = wheel(cells, rng.uniform(0, 2 * np.pi), bool(k % 2))
+        start = np.clip(resize_pattern(default_pattern(), cells), DARKEST, 1)
+        if k:
+            start = wheel(cells, rng.uniform(0, 2 * np.pi), k % 2 == 0)
         tell(0.55 + 0.45 * k / starts)
         step = lambda f, k=k: tell(0.55 + 0.45 * (k + f) / starts)  # noqa: E731
         found.append(optimise(train, start, iterations, progress=step))
