@@ -2,51 +2,28 @@
 
 from __future__ import annotations
 
-import json
-import os
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from invrender.ball import find_ball
-from invrender.capture import Lights, crop_sample, extract_lights, load_capture
+from invrender.capture import crop_sample, extract_lights, load_capture
 from invrender.errors import InputError
-from invrender.images import Photo, write_exr, write_png
-from invrender.maps import map_errors, write_maps
+from invrender.images import Photo
+from invrender.maps import map_errors
 from invrender.materials import resize_maps
+from invrender.results import Report, write_results
 from invrender.rig import Rig
-
-if TYPE_CHECKING:  # Dr.Jit compiles where the refinement is imported
-    from invrender.refine import Refined
 
 Array = NDArray[np.floating[Any]]
 FINAL_SAMPLES = 256
-
-
-@dataclass
-class Report:
-    """What a run measured; written as ``report.json``."""
-
-    capture: str
-    size: int
-    init: str
-    seconds: dict[str, float]
-    photo_error: dict[str, float]
-    converged: bool
-    history: list[dict[str, float]]
-    capture_fit: dict[str, Any]
-    warnings: list[str]
-    map_error: dict[str, dict[str, float]] | None
-    versions: dict[str, str]
 
 
 def refine_capture(
@@ -136,6 +113,7 @@ def refine_capture(
         capture=folder.name,
         size=size,
         init=init,
+        sample_size=rig.sample_size,
         seconds=seconds,
         photo_error={"initial": before, "refined": after},
         converged=result.converged,
@@ -152,7 +130,7 @@ def refine_capture(
         versions={n: version(n) for n in ("invrender", "drjit", "mitsuba", "numpy")},
     )
     with stage("write"):
-        _write(out, report, lights, result, photo, pictures[1])
+        write_results(out, report, lights, result, photo, pictures[1])
     return report
 
 
@@ -165,16 +143,6 @@ def _network() -> Any:
             f"the network needs {e.name}: pip install 'invrender[nets]', or start flat: --init flat"
         ) from None
     return Reconstructor()
-
-
-def deviations(sigma: Array) -> dict[str, Array]:
-    """Standard deviation of each map from those of θ (H, W, 9); of normals that of n/2 + 1/2."""
-    slopes = np.sqrt(np.mean(sigma[..., 7:9] ** 2, -1)) / 2
-    parts = {
-        "diffuse": sigma[..., 0:3], "specular": sigma[..., 3:6],
-        "roughness": sigma[..., 6], "normal": slopes,
-    }  # fmt: skip
-    return {k: np.ascontiguousarray(v, np.float32) for k, v in parts.items()}
 
 
 def crop_mask(photo: Photo, rig: Rig, size: int) -> NDArray[np.bool_]:
@@ -203,33 +171,3 @@ def _warnings(clipped: NDArray[np.bool_], converged: bool) -> list[str]:
     if not converged:
         warnings.append("refinement had not converged when it reached its step limit")
     return warnings
-
-
-def _write(
-    out: Path,
-    report: Report,
-    lights: Lights,
-    result: Refined,
-    photo: Array,
-    picture: Array,
-) -> None:
-    """Everything goes to a folder beside ``out`` first, so that nothing is ever half-written."""
-    out.parent.mkdir(parents=True, exist_ok=True)
-    white = max(float(np.percentile(photo, 99.5)), 1e-12)
-    with tempfile.TemporaryDirectory(dir=out.parent, prefix=".") as name:
-        new = Path(name)
-        write_maps(new, result.maps)
-        for key, image in deviations(result.sigma).items():
-            write_exr(new / f"sigma_{key}.exr", image)
-        for key, image in result.maps.encoded().items():
-            write_png(new / f"{key}.png", image, linear=key in ("normal", "roughness"))
-        write_exr(new / "environment.exr", lights.environment)
-        write_exr(new / "pattern.exr", lights.pattern_captured)
-        write_png(new / "photo.png", photo / white)
-        write_png(new / "render.png", picture / white)
-        # Grey where they agree; a tenth of white away from black or white.
-        write_png(new / "difference.png", 0.5 + 5 * (picture - photo) / white, linear=True)
-        (new / "report.json").write_text(json.dumps(report.__dict__, indent=2) + "\n")
-        out.mkdir(exist_ok=True)
-        for file in sorted(new.iterdir()):
-            os.replace(file, out / file.name)
