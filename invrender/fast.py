@@ -8,19 +8,18 @@ bias is that of the footprints and falls as samples grow.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 from invrender import brdf
 from invrender.backend import dr, vector
 from invrender.irradiance import screen_cell
 from invrender.lamps import LAMP_SIDES, MAX_HOT
-from invrender.pyramid import disc, disc_direction, disc_level, square_level
-from invrender.scene import Scene, ScreenFrame, View, screen_frame, unit
+from invrender.pyramid import disc_direction
+from invrender.scene import Scene, ScreenFrame, View, screen_frame
 from invrender.shading import Shading, Sums, with_tangents
+from invrender.specular import Sample, reflected, reflected_rows, sample_lobe
 from invrender.tables import Tables
 
-SCREEN_BIAS, SKY_BIAS = 0.0, -0.5  # levels added to a look-up whose footprint is a sample's share
 LAMP_SAMPLES = 256  # at least so many where a narrow lobe meets a lamp
 STEEP_SIDE = 16  # screen cells a side where a normal's horizon cuts the screen
 
@@ -55,12 +54,12 @@ def shade_fast(
     if tables.screen is not None or tables.sky is not None:
 
         def specular(i: Any) -> list[list[Any]]:
-            f = lambda r, n: _sample(tables, screen, view, i, inv_n, r * r, n).flat()  # noqa: E731
+            f = lambda r, n: sample_lobe(tables, screen, view, i, inv_n, r * r, n).flat()  # noqa: E731
             if not jacobian:
-                return [_specular(tables, _Sample.of(tables, f(rho, normal)))]
+                return [reflected(tables, Sample.of(tables, f(rho, normal)))]
             values, tangents = with_tangents(f, rho, normal)
-            return _specular_rows(
-                tables, _Sample.of(tables, values), [_Sample.of(tables, t) for t in tangents]
+            return reflected_rows(
+                tables, Sample.of(tables, values), [Sample.of(tables, t) for t in tangents]
             )
 
         sums.run(n_samples, specular, (1, 2), "specular", inv_n)
@@ -122,6 +121,7 @@ def _add_lamps(
 
     sums.run(count * points, lobe, (1, 2), "lamp lobes", following=next_point)
 
+    # The lamps that are left to samples, a bit each.
     def mark(lamp: Any, near: Any) -> tuple[Any, Any]:
         bit = word(1) << word(lamp)
         return lamp + 1, near | dr.select(side_of(lamp) == 0, bit, 0)
@@ -133,7 +133,24 @@ def _add_lamps(
         mark,
         label="lamps in the lobe's core",
     )
-    inv_n = 1 / type(alpha)(samples)
+    _add_lamp_images(sums, tables, screen, view, rho, normal, samples, near)
+
+
+def _add_lamp_images(
+    sums: Sums,
+    tables: Tables,
+    screen: ScreenFrame | None,
+    view: View,
+    rho: Any,
+    normal: Any,
+    samples: Any,
+    near: Any,
+) -> None:
+    """Lamps as the lobe's samples meet them; near: a 64-bit word whose bits tell which lamps."""
+    lamps = tables.lamps
+    assert lamps is not None
+    uint, word = type(samples), type(near)
+    inv_n = 1 / tables.scene.scalar(samples)
 
     def lamp_after(lamp: Any) -> Any:
         """The next marked lamp from this one on, 64 if there is none."""
@@ -143,7 +160,7 @@ def _add_lamps(
         lamp = i // samples
 
         def terms(r: Any, n: Any) -> tuple[Any, Any]:
-            sample = _sample(tables, screen, view, i - lamp * samples, inv_n, r * r, n)
+            sample = sample_lobe(tables, screen, view, i - lamp * samples, inv_n, r * r, n)
             x, y, _ = sample.sky
             d = disc_direction(2 * x - 1, 1 - 2 * y, type(normal))
             light = lamps.tent(lamp, d) * dr.select(d.z > 0, sample.weight, 0)
@@ -160,137 +177,6 @@ def _add_lamps(
 
     first, stop = lamp_after(uint(0)) * samples, MAX_HOT * samples
     sums.run(stop, image, (1, 2), "lamp images", inv_n, next_sample, first)
-
-
-@dataclass
-class _Sample:
-    """A sample of the specular lobe: what is looked up where, or a derivative of that.
-
-    weight: G2/G1, or zero where nothing is reflected. screen: (s, 1 - t, level). sky: (x, y, level)
-    on the disc's square.
-    """
-
-    weight: Any
-    fresnel: Any
-    screen: Any
-    sky: Any
-
-    def flat(self) -> tuple[Any, ...]:
-        return (self.weight, self.fresnel, *self.screen, *self.sky)
-
-    @staticmethod
-    def of(tables: Tables, flat: Any) -> _Sample:
-        """Inverse of `flat`."""
-        weight, fresnel, *rest = flat
-        n = 3 if tables.screen is not None else 0
-        return _Sample(weight, fresnel, list(rest[:n]), list(rest[n:]))
-
-
-def _sample(
-    tables: Tables,
-    screen: ScreenFrame | None,
-    view: View,
-    i: Any,
-    inv_n: Any,
-    alpha: Any,
-    n: Any,
-) -> _Sample:
-    """Sample i of N of the specular integral, filtered to its share 1/(N·pdf) of the lobe.
-
-    Smooth in α and n: directions move with the parameters.
-    """
-    scalar = type(alpha)
-    s, t = brdf.frame(n)
-    v = brdf.to_viewer(view.to_camera, s, t, n)
-    # Rank-1 lattice (golden ratio) with a random rotation a pixel.
-    u1 = unit(i * 2654435769 + view.hash, scalar)
-    u2 = dr.fma(scalar(i), inv_n, 0.5 * inv_n)
-    h = brdf.sample_vndf(v, alpha, u1, u2)
-    v_h = dr.dot(v, h)
-    local = dr.fma(h, 2 * v_h, -v)
-    d = brdf.to_world(local, s, t, n)
-    valid = (local.z > 0) & (d.z > -0.2)
-    lz = dr.select(valid, local.z, 1)
-    a2 = alpha * alpha
-    root_l = dr.sqrt(dr.fma(a2, local.x * local.x + local.y * local.y, lz * lz))
-    root_v = dr.sqrt(dr.fma(a2, v.x * v.x + v.y * v.y, v.z * v.z))
-    weight = lz * (v.z + root_v) / dr.fma(v.z, root_l, lz * root_v)  # G2 / G1(v)
-    pdf = brdf.ggx_d(h, alpha) / (2 * (v.z + root_v))
-    omega = dr.minimum(inv_n / pdf, 2 * dr.pi)
-    on_screen, on_sky = [], []
-    if screen is not None and tables.screen is not None:
-        ps, pt, r, cos, ahead = screen.hit(d)
-        area = omega * r * r / (dr.select(ahead, cos, 1) * screen.area)
-        # What does not meet the plane reads far outside.
-        on_screen = [
-            dr.select(ahead, ps, -8),
-            dr.select(ahead, 1 - pt, -8),
-            square_level(tables.screen.n, area) + SCREEN_BIAS,
-        ]
-    if tables.sky is not None:
-        x, y = disc(d)
-        level = disc_level(tables.sky.n, omega) + SKY_BIAS
-        on_sky = [dr.fma(x, 0.5, 0.5), dr.fma(y, -0.5, 0.5), level]
-    return _Sample(dr.select(valid, weight, 0), brdf.schlick(v_h), on_screen, on_sky)
-
-
-MIN_COVER = 0.02  # of a sky footprint that the screen does not always hide
-
-
-def _rgb(v: Any) -> Any:
-    return vector(type(v.x), 3)(v.x, v.y, v.z)
-
-
-def _specular(tables: Tables, sample: _Sample) -> list[Any]:
-    """Terms of B and A."""
-    light: Any = 0
-    share: Any = 1
-    if tables.screen is not None:
-        rgba = tables.screen(*sample.screen)
-        light, share = _rgb(rgba), 1 - rgba.w
-    if tables.sky is not None:
-        x, y, level = sample.sky
-        rgba = tables.sky(x, y, level)
-        light = light + _rgb(rgba) * (share / dr.maximum(rgba.w, MIN_COVER))
-    light = light * sample.weight
-    return [light * (1 - sample.fresnel), light * sample.fresnel]
-
-
-def _specular_rows(tables: Tables, sample: _Sample, tangents: list[_Sample]) -> list[list[Any]]:
-    """`_specular` and its tangents by the chain rule: one set of texels serves all of them."""
-
-    def chain(slopes: list[Any], t: list[Any]) -> Any:
-        return slopes[0] * t[0] + slopes[1] * t[1] + slopes[2] * t[2]
-
-    light: Any = 0
-    share: Any = 1
-    d_light: list[Any] = [0] * 3
-    d_share: list[Any] = [0] * 3
-    if tables.screen is not None:
-        rgba, *slopes = tables.screen.slopes(*sample.screen)
-        light, share = _rgb(rgba), 1 - rgba.w
-        for k, t in enumerate(tangents):
-            d = chain(slopes, t.screen)
-            d_light[k], d_share[k] = _rgb(d), -d.w
-    if tables.sky is not None:
-        x, y, level = sample.sky
-        rgba, *slopes = tables.sky.slopes(x, y, level)
-        inverse = 1 / dr.maximum(rgba.w, MIN_COVER)
-        sky, share = _rgb(rgba), share * inverse
-        light = light + sky * share
-        for k, t in enumerate(tangents):
-            d = chain(slopes, t.sky)
-            change = dr.select(rgba.w > MIN_COVER, d.w, 0) * share
-            d_light[k] = d_light[k] + _rgb(d) * share + sky * ((d_share[k] - change) * inverse)
-    rows = [
-        [light * (sample.weight * (1 - sample.fresnel)), light * (sample.weight * sample.fresnel)]
-    ]
-    for k, t in enumerate(tangents):
-        slope = d_light[k] * sample.weight + light * t.weight
-        bent = light * (sample.weight * t.fresnel)
-        f = sample.fresnel
-        rows.append([slope * (1 - f) - bent, slope * f + bent])
-    return rows
 
 
 def _lobe(view: View, alpha: Any, n: Any, d: Any) -> tuple[Any, Any]:
