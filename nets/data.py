@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from safetensors.numpy import save_file
 from scipy.ndimage import gaussian_filter
@@ -46,10 +47,12 @@ from invrender.materials import (
     procedural_material,
 )
 from invrender.pattern import default_pattern
-from invrender.render import Material, prepare, radiance
+from invrender.render import Material, Tables, Unbiased, prepare, radiance
 from invrender.rig import Rig
 from invrender.scene import make_scene, make_view
 from nets.clues import light_inputs, white_level
+from nets.infer import estimate_of, linearised, predict
+from nets.loader import positions
 from nets.noise import (
     capture_pattern,
     captured_environment,
@@ -60,6 +63,7 @@ from nets.noise import (
 )
 from nets.sheet import problems
 from nets.splitsum import area_resize
+from nets.store import load_weights
 
 Array = NDArray[np.floating[Any]]
 Sample = dict[str, Array]
@@ -77,6 +81,8 @@ class Options:
 
     procedural: share of made-up materials and rooms where folders are given. per_room: captures in
     the same room with the same rig. pattern: an image file, or the default pattern where empty.
+    network: weights; where given, captures are not for that network but for the correction of its
+    maps (`nets.correction`).
     """
 
     size: int = 128
@@ -89,6 +95,7 @@ class Options:
     per_room: int = 2
     env_height: int = 64
     pattern: str = ""
+    network: str = ""
 
 
 # --- lights ---------------------------------------------------------------------------------------
@@ -228,6 +235,7 @@ def make_group(rng: np.random.Generator, options: Options) -> list[Sample]:
     # Light adds up: the room beside a dark screen, and the screen alone as it is and should be.
     room = prepare(make_scene(true, np.ones_like(pattern), env, gain=0.0))
     screens = [prepare(make_scene(true, p, None, g)) for p, g in ((shown, 1.0), (pattern, gain))]
+    known_lights = None
     out = []
     for _ in range(options.per_room):
         maps = draw_material(rng, options)
@@ -239,9 +247,34 @@ def make_group(rng: np.random.Generator, options: Options) -> list[Sample]:
         sample = {"photo": sensor(rng, a + b), "ideal": a + c, **lights}
         if all(np.isfinite(v).all() for v in sample.values()):
             packed = _pack(sample, unit, maps)
-            if not problems(packed):
-                out.append(packed)
+            if problems(packed):
+                continue
+            if options.network:
+                known_lights = known_lights or prepare(make_scene(known, pattern, seen, gain))
+                packed = _for_correction(packed, unit, known_lights, options)
+            out.append(packed)
     return out
+
+
+def _for_correction(
+    sample: Sample, unit: float, prepared: Tables | Unbiased, options: Options
+) -> Sample:
+    """What a network makes of a capture, as the correction sees it."""
+    batch = {
+        k: torch.from_numpy(v.astype(np.float32))[None] for k, v in sample.items() if k != "maps"
+    }
+    batch["position"] = positions(options.size, options.size)[None]
+    found = estimate_of(predict(network_cached(options.network), batch), unit)
+    photo = np.moveaxis(sample["photo"].astype(np.float32), 0, -1) * unit
+    clipped = (photo >= 0.999 * photo.max()).any(-1)
+    seen = linearised(photo, prepared, found, clipped, options.samples)
+    out = {k: np.clip(v, -6e4, 6e4).astype(np.float16) for k, v in seen.items() if k != "position"}
+    return {**out, "maps": sample["maps"]}
+
+
+@lru_cache(maxsize=1)
+def network_cached(path: str) -> torch.nn.Module:
+    return load_weights(Path(path))[0]
 
 
 def _material(maps: Maps) -> Material:
@@ -312,8 +345,6 @@ def _work(job: tuple[Path, int, Options, int]) -> tuple[int, float]:
 
 
 def _single_thread() -> None:
-    import torch
-
     dr.set_thread_count(1)
     torch.set_num_threads(1)
 

@@ -1,11 +1,11 @@
-"""From a capture's sample and lights to material maps and their uncertainty."""
+"""From a capture's sample and lights to material maps and their uncertainty, and one step on."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -15,13 +15,17 @@ from torch import Tensor
 from invrender.errors import InputError
 from invrender.maps import Maps
 from invrender.rig import Rig
-from nets.clues import light_inputs
-from nets.loader import positions
-from nets.model import MAPS, Batch, load_weights
+from nets.clues import light_inputs, white_level
+from nets.loader import PIXELS, positions
+from nets.model import MAPS, Batch
+from nets.store import load_weights
+
+if TYPE_CHECKING:
+    from invrender.render import Tables, Unbiased
 
 Array = NDArray[np.floating[Any]]
 
-WEIGHTS = Path(__file__).with_name("weights") / "small.safetensors"
+WEIGHTS = Path(__file__).with_name("weights")
 TILE, OVERLAP = 1024, 64
 
 
@@ -30,17 +34,19 @@ class Estimate:
     """Maps, and for each the standard deviation (H, W) that the network expects of its error.
 
     Those of normals are of the encoded map, n/2 + 1/2; where the photo says nothing they are large.
+    unit: the radiance of a white plane under the capture's lights.
     """
 
     maps: Maps
     sigma: dict[str, Array]
+    unit: float
 
 
 class Reconstructor:
     """A network ready for use. Raises `InputError` where there are no weights."""
 
     def __init__(self, weights: Path | None = None) -> None:
-        self.network, self.notes = load_weights(WEIGHTS if weights is None else Path(weights))
+        self.network, self.notes = load_weights(weights or WEIGHTS / "small.safetensors")
 
     def __call__(
         self,
@@ -68,35 +74,86 @@ class Reconstructor:
         batch = {k: torch.from_numpy(v)[None] for k, v in lights.items()}
         batch["photo"] = torch.from_numpy(np.ascontiguousarray(photo.transpose(2, 0, 1)))[None]
         batch["position"] = positions(*photo.shape[:2])[None]
-        out = self.predict(batch, lambda x: report(0.3 + 0.7 * x))
-        return _estimate(out)
+        out = predict(self.network, batch, lambda x: report(0.3 + 0.7 * x))
+        return estimate_of(out, white_level(lights))
 
-    @torch.inference_mode()
-    def predict(self, batch: Batch, progress: Callable[[float], None] | None = None) -> Batch:
-        """The network on a batch of any size, in overlapping tiles where it is large."""
-        height, width = batch["photo"].shape[-2:]
-        tiles = list(_tiles(height, width))
-        if len(tiles) == 1:
-            out = self.network(batch)
-            if progress:
-                progress(1.0)
-            return out
-        sums: dict[str, Tensor] = {}
-        total = torch.zeros(1, 1, height, width)
-        for i, (rows, columns) in enumerate(tiles):
-            cut = {
-                k: v[..., rows, columns] if k in ("photo", "position") else v
-                for k, v in batch.items()
-            }
-            weight = _ramp(rows, height)[:, None] * _ramp(columns, width)
-            for k, v in self.network(cut).items():
-                if k not in sums:
-                    sums[k] = torch.zeros(*v.shape[:2], height, width)
-                sums[k][..., rows, columns] += v * weight
-            total[..., rows, columns] += weight
-            if progress:
-                progress((i + 1) / len(tiles))
-        return {k: v / total for k, v in sums.items()}
+
+class Corrector:
+    """The learned correction (`nets.correction`) ready for use."""
+
+    def __init__(self, weights: Path | None = None) -> None:
+        self.network, self.notes = load_weights(weights or WEIGHTS / "correction.safetensors")
+
+    def __call__(
+        self,
+        photo: Array,
+        prepared: Tables | Unbiased,
+        estimate: Estimate,
+        clipped: NDArray[np.bool_] | None = None,
+        samples: int = 64,
+    ) -> Estimate:
+        """One step from an estimate towards what explains the photo (H, W, 3); ``clipped``: where
+        it is saturated."""
+        batch = linearised(photo, prepared, estimate, clipped, samples)
+        out = predict(self.network, {k: torch.from_numpy(v)[None] for k, v in batch.items()})
+        return estimate_of(out, estimate.unit)
+
+
+def linearised(
+    photo: Array,
+    prepared: Tables | Unbiased,
+    estimate: Estimate,
+    clipped: NDArray[np.bool_] | None,
+    samples: int,
+) -> dict[str, Array]:
+    """The correction's inputs (`nets.correction`) as float32 arrays without a batch axis."""
+    from invrender.refine import linearise, to_theta
+
+    theta = to_theta(estimate.maps)
+    image, jacobian = linearise(prepared, theta, samples)
+    diagonal = [jacobian[..., range(3), range(k, k + 3)] for k in (0, 3)]
+    columns = [jacobian[..., k] for k in (6, 7, 8)]
+    unit = max(estimate.unit, 1e-20)
+    seen = np.zeros(theta.shape[:2], bool) if clipped is None else clipped
+    images = {
+        "photo": photo / unit,
+        "image": image / unit,
+        "jacobian": np.concatenate([*diagonal, *columns], -1) / unit,
+        "theta": theta,
+        "sigma0": np.stack([estimate.sigma[k] for k in MAPS], -1),
+        "clipped": seen[..., None],
+    }
+    out = {k: np.ascontiguousarray(np.moveaxis(v, -1, 0), np.float32) for k, v in images.items()}
+    return {**out, "position": positions(*theta.shape[:2]).numpy()}
+
+
+@torch.inference_mode()
+def predict(
+    network: torch.nn.Module, batch: Batch, progress: Callable[[float], None] | None = None
+) -> Batch:
+    """A network on a batch of any size, in overlapping tiles where it is large."""
+    height, width = batch["photo"].shape[-2:]
+    tiles = list(_tiles(height, width))
+    if len(tiles) == 1:
+        out = network(batch)
+        if progress:
+            progress(1.0)
+        return out
+    sums: dict[str, Tensor] = {}
+    total = torch.zeros(1, 1, height, width)
+    for i, (rows, columns) in enumerate(tiles):
+        cut = {
+            k: v[..., rows, columns] if k in (*PIXELS, "position") else v for k, v in batch.items()
+        }
+        weight = _ramp(rows, height)[:, None] * _ramp(columns, width)
+        for k, v in network(cut).items():
+            if k not in sums:
+                sums[k] = torch.zeros(*v.shape[:2], height, width)
+            sums[k][..., rows, columns] += v * weight
+        total[..., rows, columns] += weight
+        if progress:
+            progress((i + 1) / len(tiles))
+    return {k: v / total for k, v in sums.items()}
 
 
 def _starts(length: int) -> list[int]:
@@ -120,7 +177,8 @@ def _ramp(part: slice, length: int) -> Tensor:
     return torch.minimum(rise, fall).clamp(max=1)
 
 
-def _estimate(out: Batch) -> Estimate:
+def estimate_of(out: Batch, unit: float) -> Estimate:
+    """The first capture of a network's output, as numpy arrays."""
     image = lambda x: np.ascontiguousarray(x[0].permute(1, 2, 0).numpy())  # noqa: E731
     normal = image(out["normal"])
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
@@ -128,4 +186,4 @@ def _estimate(out: Batch) -> Estimate:
         image(out["diffuse"]), image(out["specular"]), image(out["roughness"])[..., 0], normal
     )
     sigma = image(out["sigma"])
-    return Estimate(maps, {k: sigma[..., i] for i, k in enumerate(MAPS)})
+    return Estimate(maps, {k: sigma[..., i] for i, k in enumerate(MAPS)}, unit)

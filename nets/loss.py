@@ -64,8 +64,9 @@ def total_loss(out: Batch, batch: Batch, config: Config) -> tuple[Tensor, dict[s
         # Beyond some sigmas it grows like the error, so that outliers do not rule.
         robust = torch.where(square < 9, square, 6 * torch.sqrt(square.clamp(min=9)) - 9)
         sigma_loss = sigma_loss + (0.5 * robust + torch.log(sigma)).mean() + math.log(50)
-    error = (out["normal0"] / 2 + 0.5 - b["normal"]) / SPREAD["normal"]
-    parts["normal0"] = NORMAL0_WEIGHT * error.abs().mean()
+    if "normal0" in out:
+        error = (out["normal0"] / 2 + 0.5 - b["normal"]) / SPREAD["normal"]
+        parts["normal0"] = NORMAL0_WEIGHT * error.abs().mean()
     parts["sigma"] = SIGMA_WEIGHT * sigma_loss
     if "denoised" in out:
         ideal = encode(normalise({**batch, "target": batch["ideal"].float()}, config)["target"])

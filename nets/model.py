@@ -12,15 +12,10 @@ All of it may be in any unit of radiance: it is divided by that of a white plane
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
-from safetensors import safe_open
-from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from invrender.errors import InputError
@@ -53,7 +48,8 @@ class Config:
     active: clues of the screen's light too, and the ratio of the photo to a white plane.
     slopes: how radiance depends on the slopes, and what that says of them (`nets.slopes`).
     clue_skips: the material decoder also gets the clue encoder's skips. narrow_fusion: halve the
-    channels before the fusion blocks, not after.
+    channels before the fusion blocks, not after. correction: not this network but the correction
+    of its maps (`nets.correction`), which heeds sizes alone.
     """
 
     width: int = 16
@@ -66,20 +62,11 @@ class Config:
     clue_skips: bool = True
     narrow_fusion: bool = True
     denoiser: bool = False
+    correction: bool = False
 
     def __post_init__(self) -> None:
         if self.clues not in CLUES:
             raise InputError(f"clues must be one of {', '.join(CLUES)}, got {self.clues!r}")
-
-
-PRESETS = {
-    "small": Config(),
-    "paper": Config(
-        32, (2, 2, 4, 8), 12, (2, 2, 2, 2),
-        active=False, slopes=False, clue_skips=False, narrow_fusion=False, denoiser=True,
-    ),
-    "tiny": Config(8, (1, 1), 1, (1, 1)),  # for tests
-}  # fmt: skip
 
 
 def encode(x: Tensor) -> Tensor:
@@ -258,40 +245,3 @@ def normalise(batch: Batch, config: Config | None = None) -> Batch:
             x = torch.nan_to_num(batch[key] * scale[:, None, None, None], 0.0, 1e3, 0.0)
             out[key] = x.clamp(-1e4 if key == "slope_clues" else 0, 1e4)
     return out
-
-
-def build(name: str, **changes: Any) -> Network:
-    """A network from `PRESETS`, with fields of `Config` changed, in the channels-last layout."""
-    if name not in PRESETS:
-        raise InputError(f"no preset {name!r}; there are {', '.join(PRESETS)}")
-    network = Network(replace(PRESETS[name], **changes))
-    return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-
-
-def save_weights(path: Path, network: Network, notes: dict[str, Any], half: bool = False) -> None:
-    """Write safetensors with the `Config` and ``notes`` as JSON in its header."""
-    tensors = {k: (v.half() if half else v).contiguous() for k, v in network.state_dict().items()}
-    metadata = {"config": json.dumps(asdict(network.config)), "notes": json.dumps(notes)}
-    part = path.with_suffix(".part")
-    save_file(tensors, part, metadata=metadata)
-    part.replace(path)
-
-
-def load_weights(path: Path) -> tuple[Network, dict[str, Any]]:
-    """A network in evaluation mode from `save_weights`, and its notes. Raises `InputError`."""
-    try:
-        with safe_open(path, "pt") as f:
-            metadata = f.metadata() or {}
-        fields = json.loads(metadata["config"])
-        changes: dict[str, Any] = {k: tuple(v) if type(v) is list else v for k, v in fields.items()}
-        config = Config(**changes)
-        network = Network(config)
-        network.load_state_dict({k: v.float() for k, v in load_file(path).items()})
-    except (OSError, KeyError, TypeError, ValueError, RuntimeError) as e:
-        raise InputError(f"{path} holds no weights of this program: {e}") from None
-    except Exception as e:  # safetensors has its own error class
-        if type(e).__name__ != "SafetensorError":
-            raise
-        raise InputError(f"{path} is not a safetensors file: {e}") from None
-    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    return network.eval(), json.loads(metadata.get("notes", "{}"))

@@ -28,7 +28,8 @@ from torch.nn.parallel import DistributedDataParallel
 
 from nets.loader import batches, read_batch, shards
 from nets.loss import SPREAD, compare, total_loss
-from nets.model import CLUES, MAPS, PRESETS, Batch, Network, build, load_weights, save_weights
+from nets.model import CLUES, MAPS, Batch
+from nets.store import PRESETS, AnyNetwork, build, load_weights, save_weights
 
 EMA_DECAY = 0.999
 
@@ -45,7 +46,7 @@ def learning_rate(step: int, steps: int, peak: float, last: float = 1e-7, warm: 
 class Trainer:
     """Network, optimiser, mean weights and their state on disk."""
 
-    def __init__(self, network: Network, out: Path, device: torch.device, decay: float) -> None:
+    def __init__(self, network: AnyNetwork, out: Path, device: torch.device, decay: float) -> None:
         self.out, self.device = out, device
         self.network = network.to(device)
         self.module: nn.Module = self.network
@@ -133,7 +134,7 @@ class _Averaged:
     def __init__(self, trainer: Trainer) -> None:
         self.trainer = trainer
 
-    def __enter__(self) -> Network:
+    def __enter__(self) -> AnyNetwork:
         network = self.trainer.network
         self.own = {k: v.detach().clone() for k, v in network.state_dict().items()}
         network.load_state_dict(self.trainer.mean)
@@ -145,7 +146,7 @@ class _Averaged:
 
 @torch.no_grad()
 def validate(
-    network: Network, folder: Path, device: torch.device, batch: int = 8, limit: int = 256
+    network: AnyNetwork, folder: Path, device: torch.device, batch: int = 8, limit: int = 256
 ) -> dict[str, float]:
     """RMSE of each map over all pixels and captures of a folder's first shards together, their
     average; coverage_X, the share of the true values within one sigma; scale_X, the factor on sigma
@@ -205,7 +206,7 @@ def train(args: argparse.Namespace) -> Trainer:
         torch.set_num_threads(args.threads)
     torch.manual_seed(args.seed)
     changes: dict[str, Any] = {"clues": args.clues} if args.clues else {}
-    for name in ("active", "denoiser"):
+    for name in ("active", "slopes", "denoiser"):
         if (value := getattr(args, name)) is not None:
             changes[name] = value == "on"
     args.out.mkdir(parents=True, exist_ok=True)
@@ -317,6 +318,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--preset", default="small", choices=tuple(PRESETS))
     p.add_argument("--clues", choices=CLUES)
     p.add_argument("--active", choices=("on", "off"))
+    p.add_argument("--slopes", choices=("on", "off"))
     p.add_argument("--denoiser", choices=("on", "off"))
     p.add_argument("--weights", type=Path, help="start from these")
     p.add_argument("--steps", type=int, default=50000)

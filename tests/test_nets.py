@@ -15,7 +15,8 @@ from nets import clues, slopes, splitsum  # noqa: E402
 from nets.blocks import NAFBlock, pad_to  # noqa: E402
 from nets.infer import Reconstructor, _tiles  # noqa: E402
 from nets.loader import positions  # noqa: E402
-from nets.model import CLUES, build, load_weights, normalise, save_weights  # noqa: E402
+from nets.model import CLUES, normalise  # noqa: E402
+from nets.store import build, load_weights, save_weights  # noqa: E402
 
 RIG = Rig()
 torch.set_num_threads(1)  # small tensors: more only get in each other's way

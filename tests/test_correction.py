@@ -1,0 +1,131 @@
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from invrender.maps import constant_maps  # noqa: E402
+from invrender.pattern import block_pattern  # noqa: E402
+from invrender.render import material_from_maps, prepare, radiance  # noqa: E402
+from invrender.rig import Rig  # noqa: E402
+from invrender.scene import make_scene, make_view  # noqa: E402
+from nets.correction import ALBEDO_CORRELATION, INPUTS, NOISE, features, gauss_newton  # noqa: E402
+from nets.infer import Corrector, Estimate, linearised  # noqa: E402
+from nets.loader import positions  # noqa: E402
+from nets.store import build, load_weights, save_weights  # noqa: E402
+
+SIZE = 12
+torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="module")
+def lit():
+    """A prepared scene and the photo of a flat sample in it."""
+    prepared = prepare(make_scene(Rig(), block_pattern(64), None, gain=2.0))
+    maps = constant_maps(SIZE, SIZE, 0.4, 0.04, 0.4)
+    view = make_view(prepared.scene, SIZE, SIZE)
+    color = radiance(prepared, view, material_from_maps(maps), 64)
+    return prepared, np.asarray(color).T.reshape(SIZE, SIZE, 3)
+
+
+def guess(diffuse=0.3, unit=0.7):
+    sigma = {"normal": 0.05, "diffuse": 0.1, "roughness": 0.1, "specular": 0.05}
+    grids = {k: np.full((SIZE, SIZE), v, np.float32) for k, v in sigma.items()}
+    return Estimate(constant_maps(SIZE, SIZE, diffuse, 0.04, 0.5), grids, unit)
+
+
+def random_batch(dtype=torch.float64):
+    torch.manual_seed(1)
+    shape = (2, 1, 5, 4)
+    rand = lambda n: torch.rand(2, n, 5, 4, dtype=dtype)  # noqa: E731
+    return {
+        "photo": rand(3),
+        "image": rand(3),
+        "theta": rand(9),
+        "sigma0": 0.02 + 0.2 * rand(4),
+        "jacobian": torch.cat([rand(6), rand(9) - 0.5], 1),
+        "clipped": torch.zeros(shape, dtype=dtype),
+        "position": positions(5, 4)[None].repeat(2, 1, 1, 1).to(dtype),
+    }
+
+
+def test_gauss_newton_is_the_formula():
+    b = random_batch()
+    residual, step, surprise = gauss_newton(b)
+    s = b["sigma0"][1, :, 2, 3].numpy()
+    sigma = np.diag([s[1]] * 3 + [s[3]] * 3 + [s[2]] + [2 * s[0]] * 2)
+    correlation = np.eye(9)
+    for at, rho in zip((0, 3), ALBEDO_CORRELATION, strict=True):
+        correlation[at : at + 3, at : at + 3] = rho + (1 - rho) * np.eye(3)
+    j = b["jacobian"][1, :, 2, 3].numpy().reshape(5, 3)
+    jacobian = np.concatenate([np.diag(j[0]), np.diag(j[1]), j[2:].T], 1)
+    photo = b["photo"][1, :, 2, 3].numpy()
+    noise = np.diag((NOISE[0] * photo) ** 2 + NOISE[1] ** 2)
+    spread = jacobian @ sigma @ correlation @ sigma @ jacobian.T + noise
+    r = photo - b["image"][1, :, 2, 3].numpy()
+    white = np.linalg.solve(spread, r)
+    expected = correlation @ sigma @ jacobian.T @ white
+    np.testing.assert_allclose(residual[1, :, 2, 3].numpy(), r)
+    np.testing.assert_allclose(step[1, :, 2, 3].numpy(), expected, rtol=1e-8)
+    np.testing.assert_allclose(surprise[1, 0, 2, 3].numpy(), r @ white / 3, rtol=1e-8)
+
+
+def test_saturated_pixels_say_nothing():
+    b = random_batch()
+    b["clipped"][:, :, :2] = 1
+    residual, step, _ = gauss_newton(b)
+    assert not residual[:, :, :2].any() and not step[:, :, :2].any()
+    assert step[:, :, 2:].any()
+
+
+def test_a_fresh_correction_changes_nothing(lit):
+    prepared, photo = lit
+    start = guess()
+    corrector = Corrector.__new__(Corrector)
+    corrector.network = build("correction").eval()
+    after = corrector(photo, prepared, start)
+    np.testing.assert_allclose(after.maps.diffuse, start.maps.diffuse, atol=1e-6)
+    np.testing.assert_allclose(after.maps.normal, start.maps.normal, atol=1e-6)
+    np.testing.assert_allclose(after.sigma["roughness"], start.sigma["roughness"], rtol=1e-5)
+
+
+def test_the_step_it_sees_points_at_the_truth(lit):
+    """A sample darker than it should be: the proposed step brightens the diffuse albedo."""
+    prepared, photo = lit
+    inputs = linearised(photo, prepared, guess(0.3), None, 64)
+    batch = {k: torch.from_numpy(v)[None] for k, v in inputs.items()}
+    _, step, _ = gauss_newton(batch)
+    assert (step[:, :3] > 0).float().mean() > 0.95
+    assert features(batch).shape == (1, INPUTS, SIZE, SIZE)
+
+
+def test_unit_of_radiance_does_not_matter(lit):
+    prepared, photo = lit
+    brighter = prepare(make_scene(Rig(), block_pattern(64), None, gain=200.0))
+    a = linearised(photo, prepared, guess(unit=0.7), None, 64)
+    b = linearised(100 * photo, brighter, guess(unit=70.0), None, 64)
+    for k, v in a.items():
+        np.testing.assert_allclose(b[k], v, rtol=2e-3, atol=1e-4, err_msg=k)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 0.0, 1e30])
+def test_nothing_but_numbers_leaves(value):
+    network = build("correction").eval()
+    with torch.no_grad():
+        for p in network.parameters():
+            p.normal_(0, 0.1)
+    b = {k: v.float() for k, v in random_batch().items()}
+    b["photo"][:, :, 1] = value
+    b["image"][:, :, 2] = value
+    with torch.inference_mode():
+        out = network(b)
+    for k, v in out.items():
+        assert torch.isfinite(v).all(), k
+
+
+def test_weights_come_back(tmp_path):
+    network = build("correction")
+    save_weights(tmp_path / "c.safetensors", network, {})
+    again, _ = load_weights(tmp_path / "c.safetensors")
+    assert type(again) is type(network)
+    for k, v in network.state_dict().items():
+        torch.testing.assert_close(again.state_dict()[k], v)
