@@ -17,8 +17,8 @@ from invrender.pattern import block_pattern  # noqa: E402
 from nets import data, sheet, train  # noqa: E402
 from nets.loader import batches, positions, read_batch, shards  # noqa: E402
 from nets.loss import MAPS, SPREAD, compare, total_loss, truth  # noqa: E402
-from nets.store import build, load_weights  # noqa: E402
 from nets.sheet import problems  # noqa: E402
+from nets.store import build, load_weights  # noqa: E402
 
 OPTIONS = data.Options(size=16, samples=8, seed=3)
 torch.set_num_threads(1)  # small tensors: more only get in each other's way
