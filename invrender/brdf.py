@@ -47,11 +47,6 @@ def to_world(d: Any, s: Any, t: Any, n: Any) -> Any:
     return dr.fma(s, d.x, dr.fma(t, d.y, n * d.z))
 
 
-def ggx_lambda(w: Any, alpha: Any) -> Any:
-    """Smith's Λ times 2, plus 1: sqrt(1 + α² tan²θ), for w.z > 0."""
-    return dr.sqrt(dr.fma(alpha * alpha, (w.x * w.x + w.y * w.y) / (w.z * w.z), 1))
-
-
 def ggx_d(h: Any, alpha: Any) -> Any:
     """GGX normal distribution, 1/sr. Exact for the smallest α: no 1 - cos² cancellation."""
     a2 = alpha * alpha
