@@ -231,14 +231,21 @@ def render(
 
 
 def material_from_maps(
-    maps: Maps, start: int = 0, stop: int | None = None, scalar: type = Float
+    maps: Maps,
+    start: int = 0,
+    stop: int | None = None,
+    scalar: type = Float,
+    whole: bool = False,
 ) -> Material:
-    """Dr.Jit arrays of the pixels start to stop; a map that is constant becomes one entry."""
+    """Dr.Jit arrays of the pixels start to stop.
+
+    A map that is constant becomes one entry, which makes a kernel of its own, unless ``whole``.
+    """
     vec3 = vector(scalar, 3)
 
     def rows(image: NDArray[Any]) -> NDArray[Any]:
         flat = image.reshape(-1, image.shape[2] if image.ndim == 3 else 1)[start:stop]
-        if len(flat) > 1 and np.all(flat == flat[0]):
+        if not whole and len(flat) > 1 and np.all(flat == flat[0]):
             flat = flat[:1]
         return aligned(flat.T, scalar)
 

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from safetensors.numpy import save_file
 from scipy.ndimage import gaussian_filter
 
-from invrender.backend import Float, dr, vector
+from invrender.backend import dr
 from invrender.cluster import map_tasks
 from invrender.environments import (
     find_environments,
@@ -47,7 +47,7 @@ from invrender.materials import (
     procedural_material,
 )
 from invrender.pattern import default_pattern
-from invrender.render import Material, Tables, Unbiased, prepare, radiance
+from invrender.render import Tables, Unbiased, material_from_maps, prepare, radiance
 from invrender.rig import Rig
 from invrender.scene import make_scene, make_view
 from nets.clues import light_inputs, white_level
@@ -239,7 +239,7 @@ def make_group(rng: np.random.Generator, options: Options) -> list[Sample]:
     out = []
     for _ in range(options.per_room):
         maps = draw_material(rng, options)
-        material = _material(maps)
+        material = material_from_maps(maps, whole=True)
         view = make_view(room.scene, size, size, seed=int(rng.integers(2**31)))
         parts = [radiance(p, view, material, options.samples) for p in (room, *screens)]
         dr.eval(parts)
@@ -275,18 +275,6 @@ def _for_correction(
 @lru_cache(maxsize=1)
 def network_cached(path: str) -> torch.nn.Module:
     return load_weights(Path(path))[0]
-
-
-def _material(maps: Maps) -> Material:
-    """As `material_from_maps`; constant maps stay whole, lest they make kernels of their own."""
-    vec3 = vector(Float, 3)
-    rows = lambda image: np.ascontiguousarray(image.reshape(-1, 3).T, np.float32)  # noqa: E731
-    return Material(
-        vec3(rows(maps.diffuse)),
-        vec3(rows(maps.specular)),
-        Float(np.ascontiguousarray(maps.roughness.ravel(), np.float32)),
-        vec3(rows(maps.normal)),
-    )
 
 
 @lru_cache(maxsize=2)
