@@ -1,25 +1,25 @@
-"""Refinement: from initial maps and their uncertainty to the maps that explain the photo.
+"""Refinement: from initial maps and their uncertainty to the maps that explain the photos.
 
-First what all pixels of a material tell together (`invrender.lobes`), unless the initial maps know
-better; then each pixel's nine parameters θ = (k_d, k_s, ρ, slopes p and q of n ∝ (p, q, 1)) at the
-maximum of their posterior,
+Each pixel's nine parameters θ (`invrender.prior`) at the maximum of their posterior,
 
     photo ~ N(I(θ), R),     θ ~ N(θ₀, Σ),
 
 by damped Gauss–Newton steps with the exact Jacobian J of the forward model. They are taken in the
-three-dimensional space of the photo, like a Kalman filter's,
+space of the photo, three-dimensional, like a Kalman filter's,
 
     θ ← θ₀ + ΣJᵀ(JΣJᵀ + R)⁻¹ (photo - I(θ) + J(θ - θ₀)),
 
 so where the photo says nothing about a parameter, J is small and the parameter keeps its prior
-value; and Σ - ΣJᵀ(JΣJᵀ + R)⁻¹JΣ is the uncertainty that remains.
+value; and Σ - ΣJᵀ(JΣJᵀ + R)⁻¹JΣ is the uncertainty that remains. Several photos of the sample are
+stacked: two have six numbers a pixel. Pixels do not depend on each other here: large images are
+solved in bands of rows, in bounded memory.
 """
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -28,14 +28,13 @@ from numpy.typing import NDArray
 
 from invrender.backend import Float, dr, vector
 from invrender.maps import Maps
+from invrender.prior import N, Prior, R, project, to_maps
+from invrender.prior import to_theta as to_theta
 from invrender.render import Material, Tables, Unbiased, pixel_jacobian
-from invrender.scene import make_view
+from invrender.scene import aligned, make_view
 
 Array = NDArray[np.floating[Any]]
-D, S, R, N = slice(0, 3), slice(3, 6), 6, slice(7, 9)  # places of the parameters in θ
 
-MIN_ROUGHNESS = 0.03
-MAX_SLOPE = 3.0  # 72 degrees
 PHOTO_NOISE = (0.02, 0.01)  # relative to the pixel, and to the photo's mean: sensor and model
 TRUST = (0.1, 0.2)  # how far one step may move roughness and slopes
 SHARE = np.array([1] * 6 + [0] + [0.2] * 2, np.float32)  # of its step that each of θ takes
@@ -43,96 +42,55 @@ LIGHT_NOISE = (0.1, 0.05)  # as PHOTO_NOISE, for what the lights' estimate adds 
 UNLIKELY = 1.0  # mean squared residual, in its expected spread, from which a pixel counts less
 STOP = 0.02  # relative decrease of the mean cost below which steps end
 ROUNDING = 1e-5  # of the prior variance: what single precision can tell of the rest
+BAND = 1 << 17  # pixels solved at once
 
 
-@dataclass
-class Prior:
-    """What is known of θ before the photo is fitted: a Gaussian a pixel.
+@dataclass(frozen=True)
+class Shot:
+    """A photo (H, W, 3) of the sample, linear radiance, and the lights on it.
 
-    mean, sigma: (H, W, 9) in the order of θ; correlation: (9, 9), of the deviations.
+    clipped (H, W): pixels that the photo does not measure; None where it measures all.
     """
 
-    mean: Array
-    sigma: Array
-    correlation: Array
+    photo: Array
+    prepared: Tables | Unbiased
+    clipped: NDArray[np.bool_] | None = None
 
 
 @dataclass
 class Refined:
-    """Maps, their posterior standard deviations (H, W, 9) in the order of θ, how the fit went."""
+    """Maps, their posterior standard deviations (H, W, 9) in the order of θ, how the fit went.
+
+    interrupted: by Ctrl-C; the maps are the best so far.
+    """
 
     maps: Maps
     sigma: Array
     history: list[dict[str, float]] = field(default_factory=list)
     converged: bool = False
-
-
-def lobe_prior(maps: Maps) -> Prior:
-    """The uncertainty within a material of maps from `invrender.lobes`: mostly shade and relief."""
-    mean = to_theta(maps)
-    sigma = np.zeros_like(mean)
-    metal = np.clip((maps.specular - 0.06) / 0.3, 0, 1)
-    sigma[..., D] = 0.01 + 0.05 * maps.diffuse
-    sigma[..., S] = 0.002 + 0.05 * metal
-    sigma[..., R], sigma[..., N] = 0.02, 0.05
-    correlation = np.eye(9)
-    for k, r in ((D, 0.98), (S, 0.95)):  # an albedo's channels vary together
-        correlation[k, k] = r + (1 - r) * np.eye(3)
-    return Prior(mean, sigma, correlation.astype(np.float32))
-
-
-def network_prior(maps: Maps, sigma: dict[str, Array]) -> Prior:
-    """The uncertainty of a network's maps, from what it expects of its errors, (H, W) a map.
-
-    ``sigma`` of normals is that of n/2 + 1/2. An albedo's error within a material is at most a
-    share of it.
-    """
-    mean = to_theta(maps)
-    spread = np.empty_like(mean)
-    spread[..., D] = np.minimum(sigma["diffuse"][..., None], 0.01 + 0.15 * maps.diffuse)
-    spread[..., S] = np.minimum(sigma["specular"][..., None], 0.01 + 0.3 * maps.specular)
-    spread[..., R] = sigma["roughness"]
-    spread[..., N] = 2 * sigma["normal"][..., None]
-    correlation = np.eye(9)
-    for k, r in ((D, 0.9), (S, 0.95)):
-        correlation[k, k] = r + (1 - r) * np.eye(3)
-    return Prior(mean, np.maximum(spread, 1e-4), correlation.astype(np.float32))
-
-
-def to_theta(maps: Maps) -> Array:
-    """θ (H, W, 9) of maps."""
-    slopes = maps.normal[..., :2] / np.maximum(maps.normal[..., 2:], 0.1)
-    parts = [maps.diffuse, maps.specular, maps.roughness[..., None], slopes]
-    return project(np.concatenate(parts, -1).astype(np.float32))
-
-
-def to_maps(theta: Array) -> Maps:
-    """Maps of θ."""
-    normal = np.concatenate([theta[..., N], np.ones_like(theta[..., :1])], -1)
-    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    parts = (theta[..., D], theta[..., S], theta[..., R], normal)
-    return Maps(*(np.ascontiguousarray(p, dtype=np.float32) for p in parts))
-
-
-def project(theta: Array) -> Array:
-    """θ within its physical range, in place."""
-    theta[..., :6] = np.clip(theta[..., :6], 0, 1)
-    theta[..., R] = np.clip(theta[..., R], MIN_ROUGHNESS, 1)
-    slope = np.linalg.norm(theta[..., N], axis=-1, keepdims=True)
-    theta[..., N] *= np.minimum(1, MAX_SLOPE / np.maximum(slope, 1e-9))
-    return theta
+    interrupted: bool = False
 
 
 def linearise(
-    prepared: Tables | Unbiased, theta: Array, samples: int, seed: int = 0
+    prepared: Tables | Unbiased,
+    theta: Array,
+    samples: int,
+    seed: int = 0,
+    top: int = 0,
+    height: int | None = None,
 ) -> tuple[Array, Array]:
-    """Radiance (H, W, 3) at θ (H, W, 9) and its Jacobian (H, W, 3, 9)."""
+    """Radiance (H, W, 3) at θ (H, W, 9) and its Jacobian (H, W, 3, 9).
+
+    θ may be a band of rows, from row ``top``, of an image of ``height`` rows.
+    """
     h, w = theta.shape[:2]
-    flat = np.ascontiguousarray(theta.reshape(-1, 9).T)
+    flat = theta.reshape(-1, 9).T
     vec3 = vector(Float, 3)
-    normal = vec3(Float(flat[7]), Float(flat[8]), Float(1))
-    material = Material(vec3(flat[:3]), vec3(flat[3:6]), Float(flat[6]), normal)
-    j = pixel_jacobian(prepared, make_view(prepared.scene, h, w, seed), material, samples)
+    diffuse, specular = (vec3(aligned(x, Float)) for x in (flat[:3], flat[3:6]))
+    rho, p, q = (Float(aligned(x, Float)) for x in flat[6:])
+    view = make_view(prepared.scene, height or h, w, seed, top * w, h * w)
+    material = Material(diffuse, specular, rho, vec3(p, q, Float(1)))
+    j = pixel_jacobian(prepared, view, material, samples)
     slope_p = j.tangent_s * j.s.x + j.tangent_t * j.t.x
     slope_q = j.tangent_s * j.s.y + j.tangent_t * j.t.y
     dr.eval(j.radiance, j.diffuse, j.specular, j.roughness, slope_p, slope_q)
@@ -149,73 +107,117 @@ def linearise(
     return rows(j.radiance).copy(), np.nan_to_num(jacobian, posinf=0, neginf=0)
 
 
-def _noise(
-    photo: Array, mean: float, share: tuple[float, float], clipped: NDArray[np.bool_] | None
-) -> Array:
-    """Variance (H, W, 3) of the photo: shares of the pixel and of the mean, or nothing measured."""
-    noise = (share[0] * photo) ** 2 + (share[1] * mean) ** 2
-    if clipped is not None:
-        noise = np.where(clipped[..., None], np.float32(1e12) * mean**2, noise)
-    return noise
+class _Band:
+    """Rows of the stacked photos: ``photo`` and its variance ``noise`` (H, W, 3·shots).
+
+    noise: shares of the pixel and of its photo's mean, or next to infinite where not ``seen``.
+    """
+
+    def __init__(
+        self, shots: Sequence[Shot], rows: slice, share: tuple[float, float], samples: int
+    ) -> None:
+        self.shots, self.rows, self.samples = shots, rows, samples
+        photos = [s.photo[rows] for s in shots]
+        means = [max(float(s.photo.mean()), 1e-12) for s in shots]
+        seen = [
+            np.ones(p.shape[:2], bool) if s.clipped is None else ~s.clipped[rows]
+            for s, p in zip(shots, photos, strict=True)
+        ]
+        self.photo = np.concatenate(photos, -1)
+        self.mean = np.repeat(np.array(means, np.float32), 3)
+        self.seen = np.repeat(np.stack(seen, -1), 3, -1)
+        noise = (share[0] * self.photo) ** 2 + (share[1] * self.mean) ** 2
+        self.noise = np.where(self.seen, noise, np.float32(1e12) * self.mean**2)
+
+    def residual(self, theta: Array) -> tuple[Array, Array]:
+        """photo - I(θ) and the Jacobian (H, W, 3·shots, 9)."""
+        height = len(self.shots[0].photo)
+        parts = [
+            linearise(s.prepared, theta, self.samples, top=self.rows.start, height=height)
+            for s in self.shots
+        ]
+        image, jacobian = (np.concatenate(x, 2) for x in zip(*parts, strict=True))
+        return self.photo - image, jacobian
+
+    def squares(self, residual: Array) -> float:
+        """Sum of the squared residuals of what the photos measure, over their means."""
+        return float((((residual / self.mean) ** 2)[self.seen]).sum(dtype=np.float64))
 
 
-def _photo_error(residual: Array, mean: float, clipped: NDArray[np.bool_] | None) -> float:
-    """RMS residual of what the photo measures, over its mean."""
-    seen = residual if clipped is None else residual[~clipped]
-    return float(np.sqrt(np.mean(seen**2))) / mean if seen.size else 0.0
+def _bands(shots: Sequence[Shot], share: tuple[float, float], samples: int) -> Iterator[_Band]:
+    height, width = shots[0].photo.shape[:2]
+    rows = max(1, BAND // width)
+    for top in range(0, height, rows):
+        yield _Band(shots, slice(top, min(top + rows, height)), share, samples)
 
 
 def refine(
-    photo: Array,
-    prepared: Tables | Unbiased,
+    shots: Sequence[Shot],
     prior: Prior,
     *,
     samples: int = 64,
     iterations: int = 10,
-    clipped: NDArray[np.bool_] | None = None,
     progress: Callable[[int, float], None] = lambda i, error: None,
 ) -> Refined:
-    """The pixels' maximum a posteriori for a photo (H, W, 3) of the sample, linear radiance.
+    """The pixels' maximum a posteriori for the photos.
 
-    clipped (H, W): pixels that the photo does not measure; they keep their prior. Starts at the
-    prior's mean, stops when a step lowers the mean cost by less than `STOP`. A pixel whose step
-    would raise its cost stays, and tries a shorter one next.
+    Starts at the prior's mean, stops when a step lowers the mean cost by less than `STOP`. A pixel
+    whose step would raise its cost stays, and tries a shorter one next. Ctrl-C ends it with what
+    was found so far.
+    """
+    theta, sigma = project(prior.mean.copy()), prior.sigma.copy()
+    steps: list[list[Array]] = []
+    result = Refined(to_maps(theta), sigma, converged=True)
+    seen = 0
+    try:
+        for band in _bands(shots, PHOTO_NOISE, samples):
+            seen += int(band.seen.sum())
+            steps.append([])
+            result.converged &= _solve(band, prior, theta, sigma, iterations, steps[-1], progress)
+    except KeyboardInterrupt:
+        result.interrupted, result.converged = True, False
+    result.maps = to_maps(theta)
+    # A band that ended sooner stays as it was.
+    for i in range(max(map(len, steps), default=0)):
+        total = np.sum([s[min(i, len(s) - 1)] for s in steps if s], 0)
+        seconds, squares, cost, pixels = map(float, total)
+        error = float(np.sqrt(squares / max(seen, 1)))
+        result.history.append({"seconds": seconds, "photo_error": error, "cost": cost / pixels})
+    return result
+
+
+def _solve(
+    band: _Band, prior: Prior, theta: Array, sigma: Array, iterations: int,
+    steps: list[Array], progress: Callable[[int, float], None],
+) -> bool:  # fmt: skip
+    """Gauss–Newton on a band's rows of ``theta`` and ``sigma``, in place. Whether it converged.
+
+    steps: gets (seconds, sum of squares, sum of costs, pixels) of each step.
     """
     began = time.perf_counter()
-    mean = max(float(photo.mean()), 1e-12)
-    noise = _noise(photo, mean, PHOTO_NOISE, clipped)
-    sigma, correlation = prior.sigma, prior.correlation
-    precision = np.linalg.inv(correlation)
+    theta, left = theta[band.rows], sigma[band.rows]
+    mean, sigma = prior.mean[band.rows], prior.sigma[band.rows]
+    precision = np.linalg.inv(prior.correlation)
 
     def evaluate(theta: Array) -> tuple[Array, Array, Array]:
-        image, jacobian = linearise(prepared, theta, samples)
-        z = (theta - prior.mean) / sigma
-        residual = photo - image
-        misfit = (residual**2 / noise).sum(-1)
+        residual, jacobian = band.residual(theta)
+        z = (theta - mean) / sigma
+        misfit = (residual**2 / band.noise).sum(-1)
         return residual, jacobian, misfit + np.einsum("hwp,pq,hwq->hw", z, precision, z)
 
-    theta = project(prior.mean.copy())
     residual, jacobian, cost = evaluate(theta)
     length = np.ones(cost.shape, np.float32)
-    result = Refined(to_maps(theta), sigma)
     for i in range(iterations + 1):
-        error = _photo_error(residual, mean, clipped)
-        seconds = time.perf_counter() - began
-        result.history.append(
-            {"seconds": seconds, "photo_error": error, "cost": float(cost.mean())}
-        )
-        progress(i, error)
-        if i and result.history[-2]["cost"] - cost.mean() <= STOP * cost.mean():
-            result.converged = True
-            break
+        squares, total = band.squares(residual), float(cost.sum(dtype=np.float64))
+        steps.append(np.array([time.perf_counter() - began, squares, total, cost.size]))
+        progress(i, float(np.sqrt(squares / max(int(band.seen.sum()), 1))))
+        if i and steps[-2][2] - total <= STOP * total:
+            return True
         if i == iterations:
             break
-        a = jacobian * sigma[..., None, :]
-        ac = a @ correlation
-        spread = ac @ np.swapaxes(a, -1, -2)
-        spread[..., range(3), range(3)] += noise
-        gain = np.swapaxes(ac, -1, -2) @ np.linalg.inv(spread)
-        z = (theta - prior.mean) / sigma
+        a, ac, inverse = _spread(jacobian, sigma, prior.correlation, band.noise)
+        gain = np.swapaxes(ac, -1, -2) @ inverse
+        z = (theta - mean) / sigma
         target = residual + np.einsum("hwcp,hwp->hwc", a, z)
         step = sigma * (np.einsum("hwpc,hwc->hwp", gain, target) - z)
         step[..., R] = np.clip(step[..., R], -TRUST[0], TRUST[0])
@@ -226,51 +228,57 @@ def refine(
         for old, fresh in zip((theta, residual, jacobian, cost), (trial, *new), strict=True):
             old[better] = fresh[better]
         length = np.where(better, np.minimum(2 * length, 1), length / 4)
-        left = 1 - np.einsum("hwpc,hwcp->hwp", gain, ac)
-        result.sigma = sigma * np.sqrt(np.clip(left, ROUNDING, 1))
-    result.maps = to_maps(theta)
-    return result
+        rest = 1 - np.einsum("hwpc,hwcp->hwp", gain, ac)
+        left[...] = sigma * np.sqrt(np.clip(rest, ROUNDING, 1))
+    return False
 
 
-def correct(
-    photo: Array,
-    prepared: Tables | Unbiased,
-    prior: Prior,
-    *,
-    samples: int = 64,
-    clipped: NDArray[np.bool_] | None = None,
-) -> Refined:
+def _spread(
+    jacobian: Array, sigma: Array, correlation: Array, noise: Array
+) -> tuple[Array, Array, Array]:
+    """A = J·diag(σ), A·C and the inverse of the residual's expected spread A·C·Aᵀ + R."""
+    a = jacobian * sigma[..., None, :]
+    ac = a @ correlation
+    spread = ac @ np.swapaxes(a, -1, -2)
+    n = range(spread.shape[-1])
+    spread[..., n, n] += noise
+    return a, ac, np.linalg.inv(spread)
+
+
+def correct(shots: Sequence[Shot], prior: Prior, *, samples: int = 64) -> Refined:
     """One cautious step from a prior whose errors are shared by whole materials.
 
-    A network errs alike over a material, so what a pixel's own three numbers say of roughness or
-    slopes is mostly an error of something else. As in the Schmidt–Kalman filter, every parameter's
+    A network errs alike over a material, so what a pixel's own numbers say of roughness or slopes
+    is mostly an error of something else. As in the Schmidt–Kalman filter, every parameter's
     uncertainty counts in the expected spread of the residual, but each takes only its `SHARE` of
     the step. The posterior is that of this suboptimal gain K: (1 - KJ)Σ(1 - KJ)ᵀ + KRKᵀ.
     """
     began = time.perf_counter()
-    mean = max(float(photo.mean()), 1e-12)
-    noise = _noise(photo, mean, LIGHT_NOISE, clipped)
-    theta = project(prior.mean.copy())
-    image, jacobian = linearise(prepared, theta, samples)
-    residual = photo - image
-    a = jacobian * prior.sigma[..., None, :]
-    ac = a @ prior.correlation
-    spread = ac @ np.swapaxes(a, -1, -2)
-    spread[..., range(3), range(3)] += noise
-    inverse = np.linalg.inv(spread)
-    surprise = np.einsum("hwc,hwcd,hwd->hw", residual, inverse, residual) / 3
-    trust = np.sqrt(np.minimum(1, UNLIKELY / np.maximum(surprise, 1e-12)))
-    gain = SHARE[:, None] * trust[..., None, None] * (np.swapaxes(ac, -1, -2) @ inverse)
-    z = np.einsum("hwpc,hwc->hwp", gain, residual)
-    theta = project((theta + prior.sigma * z).astype(np.float32))
-    rest = np.eye(9, dtype=np.float32) - gain @ a
-    variance = np.einsum("hwpq,qr,hwpr->hwp", rest, prior.correlation, rest)
-    measured = np.where(noise > 1e6 * mean**2, 0, noise)  # where clipped, the gain is nought
-    variance += np.einsum("hwpc,hwc,hwpc->hwp", gain, measured, gain)
-    error = _photo_error(residual, mean, clipped)
+    theta, sigma = project(prior.mean.copy()), prior.sigma.copy()
+    squares, seen = 0.0, 0
+    interrupted = False
+    try:
+        for band in _bands(shots, LIGHT_NOISE, samples):
+            rows = band.rows
+            residual, jacobian = band.residual(theta[rows])
+            squares, seen = squares + band.squares(residual), seen + int(band.seen.sum())
+            a, ac, inverse = _spread(jacobian, sigma[rows], prior.correlation, band.noise)
+            surprise = np.einsum("hwc,hwcd,hwd->hw", residual, inverse, residual)
+            surprise /= residual.shape[-1]
+            trust = np.sqrt(np.minimum(1, UNLIKELY / np.maximum(surprise, 1e-12)))
+            gain = SHARE[:, None] * trust[..., None, None] * (np.swapaxes(ac, -1, -2) @ inverse)
+            z = np.einsum("hwpc,hwc->hwp", gain, residual)
+            theta[rows] = project((theta[rows] + sigma[rows] * z).astype(np.float32))
+            rest = np.eye(9, dtype=np.float32) - gain @ a
+            variance = np.einsum("hwpq,qr,hwpr->hwp", rest, prior.correlation, rest)
+            measured = np.where(band.seen, band.noise, 0)  # where clipped, the gain is nought
+            variance += np.einsum("hwpc,hwc,hwpc->hwp", gain, measured, gain)
+            sigma[rows] *= np.sqrt(np.clip(variance, 0, None))
+    except KeyboardInterrupt:
+        interrupted = True
+    error = float(np.sqrt(squares / max(seen, 1)))
     history = [{"seconds": time.perf_counter() - began, "photo_error": error}]
-    sigma = prior.sigma * np.sqrt(np.clip(variance, 0, None))
-    return Refined(to_maps(theta), sigma, history, converged=True)
+    return Refined(to_maps(theta), sigma, history, not interrupted, interrupted)
 
 
 if __name__ == "__main__":

@@ -215,11 +215,18 @@ def render(
     samples: int = 64,
     seed: int = 0,
 ) -> NDArray[np.float32]:
-    """Linear RGB image (H, W, 3) of the sample from numpy arrays, in tiles of bounded memory.
+    """Linear RGB image (H, W, 3) of the sample from numpy arrays.
 
     pattern: (P, P, 3) relative radiance; environment: (H, 2H, 3) equirectangular; either None.
     """
     prepared = prepare(make_scene(rig, pattern, environment, gain, scale), estimator)
+    return picture(prepared, maps, samples, seed)
+
+
+def picture(
+    prepared: Tables | Unbiased, maps: Maps, samples: int, seed: int = 0
+) -> NDArray[np.float32]:
+    """Linear RGB image (H, W, 3) of maps under prepared lights, in tiles of bounded memory."""
     height, width = maps.shape
     image = np.empty((height * width, 3), np.float32)
     for start in range(0, height * width, TILE):

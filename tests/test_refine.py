@@ -3,22 +3,24 @@
 import numpy as np
 import pytest
 
+from invrender import refine as refinement
 from invrender.environments import procedural_environment, scale_environment
 from invrender.initial import flat_maps
+from invrender.joint import find_turn, turned_environment, turned_rig
 from invrender.lobes import fit_lobes
 from invrender.maps import constant_maps, map_errors
+from invrender.materials import procedural_material, turn_maps
 from invrender.pattern import block_pattern
-from invrender.refine import (
+from invrender.prior import (
     MIN_ROUGHNESS,
     Prior,
-    correct,
-    linearise,
     lobe_prior,
     network_prior,
-    refine,
+    pooled,
     to_maps,
     to_theta,
 )
+from invrender.refine import Shot, correct, linearise, refine
 from invrender.render import make_scene, prepare, render
 from invrender.rig import Rig
 
@@ -93,7 +95,7 @@ def test_two_materials_get_two_lobes(prepared, environment):
 
 def test_photo_of_the_prior_changes_nothing(prepared, environment):
     maps = constant_maps(SIZE, SIZE, 0.3, 0.04, 0.5)
-    result = refine(photo_of(maps, environment), prepared, lobe_prior(maps))
+    result = refine([Shot(photo_of(maps, environment), prepared)], lobe_prior(maps))
     assert result.converged
     assert max(map_errors(result.maps, maps).values()) < 1e-3
 
@@ -108,7 +110,8 @@ def test_normals_are_recovered_where_all_else_is_known(prepared, environment):
     start = constant_maps(SIZE, SIZE, 0.3, 0.3, 0.4)
     sigma = np.full((SIZE, SIZE, 9), 1e-3, np.float32)
     sigma[..., 7:] = 0.3
-    result = refine(photo, prepared, Prior(to_theta(start), sigma, np.eye(9, dtype=np.float32)))
+    prior = Prior(to_theta(start), sigma, np.eye(9, dtype=np.float32))
+    result = refine([Shot(photo, prepared)], prior)
     before, after = map_errors(start, truth), map_errors(result.maps, truth)
     assert after["normal"] < 0.7 * before["normal"]
     errors = [h["photo_error"] for h in result.history]
@@ -125,7 +128,7 @@ def test_clipped_pixels_keep_their_prior(prepared, environment):
     prior = lobe_prior(constant_maps(SIZE, SIZE, 0.2, 0.04, 0.5))
     clipped = np.zeros((SIZE, SIZE), bool)
     clipped[:8] = True
-    result = refine(photo_of(truth, environment), prepared, prior, clipped=clipped)
+    result = refine([Shot(photo_of(truth, environment), prepared, clipped)], prior)
     np.testing.assert_allclose(result.maps.diffuse[:8], 0.2, atol=1e-3)
     assert result.maps.diffuse[8:].mean() > 0.25
 
@@ -134,7 +137,7 @@ def test_clipped_pixels_keep_their_prior(prepared, environment):
 def test_any_photo_gives_finite_maps_in_range(prepared, value):
     photo = np.full((8, 8, 3), value, np.float32)
     maps = fit_lobes(photo, prepared)
-    result = refine(photo, prepared, lobe_prior(maps), iterations=3)
+    result = refine([Shot(photo, prepared)], lobe_prior(maps), iterations=3)
     for image in result.maps.encoded().values():
         assert np.isfinite(image).all() and image.min() >= 0 and image.max() <= 1
     assert result.maps.roughness.min() >= MIN_ROUGHNESS
@@ -143,7 +146,7 @@ def test_any_photo_gives_finite_maps_in_range(prepared, value):
 
 def test_one_pixel(prepared):
     photo = np.full((1, 1, 3), 0.1, np.float32)
-    result = refine(photo, prepared, lobe_prior(fit_lobes(photo, prepared)))
+    result = refine([Shot(photo, prepared)], lobe_prior(fit_lobes(photo, prepared)))
     assert result.maps.shape == (1, 1)
 
 
@@ -156,9 +159,88 @@ def test_correction_of_a_networks_maps(prepared, environment):
     clipped = np.zeros((SIZE, SIZE), bool)
     clipped[:8] = True
     prior = network_prior(start, sigma)
-    result = correct(photo_of(truth, environment), prepared, prior, clipped=clipped)
+    result = correct([Shot(photo_of(truth, environment), prepared, clipped)], prior)
     assert map_errors(result.maps, truth)["diffuse"] < 0.7 * map_errors(start, truth)["diffuse"]
     assert np.array_equal(result.maps.roughness, start.roughness)
     assert result.maps.diffuse[:8] == pytest.approx(start.diffuse[:8], abs=1e-5)
     assert (result.sigma <= prior.sigma * 1.0001).all()
     assert (result.sigma[8:, :, 0] < 0.95 * prior.sigma[8:, :, 0]).all()
+
+
+def wrong_by(truth, seed):
+    """Maps off by what all of the material shares and by relief, and their expected errors."""
+    rng = np.random.default_rng(seed)
+    theta = to_theta(truth)
+    theta[..., :3] += 0.06 * rng.standard_normal(3).astype(np.float32)
+    theta[..., 3:6] += np.float32(0.02 * rng.standard_normal())
+    theta[..., 7:] += 0.1 * rng.standard_normal(theta[..., 7:].shape).astype(np.float32)
+    names = ("diffuse", "specular", "roughness", "normal")
+    sigma = {k: np.full(truth.shape, 0.05, np.float32) for k in names}
+    return network_prior(to_maps(theta), sigma)
+
+
+def test_two_photos_tell_more_than_one(prepared, environment):
+    """The second under another pattern and with the sample turned."""
+    truth = procedural_material(5, SIZE, SIZE, kind="leather")
+    other = PATTERN[::-1, :, ::-1].copy()
+    photo = render(RIG, turn_maps(truth, 1), other, environment, GAIN)
+    turned = make_scene(turned_rig(RIG, -1), other, turned_environment(environment, -1), GAIN)
+    shots = [
+        Shot(photo_of(truth, environment), prepared),
+        Shot(np.ascontiguousarray(np.rot90(photo, -1)), prepare(turned)),
+    ]
+    # The turned photo is what the turned lights make of the sample that lies as before.
+    image, _ = linearise(shots[1].prepared, to_theta(truth), 64)
+    assert np.abs(image - shots[1].photo).mean() < 0.02 * image.mean()
+
+    prior = wrong_by(truth, 0)
+    for step in (correct, refine):
+        one = map_errors(step(shots[:1], prior).maps, truth)["average"]
+        two = map_errors(step(shots, prior).maps, truth)["average"]
+        assert two < 0.98 * one
+
+
+def test_pooled_priors_weigh_by_precision():
+    maps = constant_maps(2, 2, 0.2, 0.04, 0.4), constant_maps(2, 2, 0.5, 0.04, 0.4)
+    names = ("diffuse", "specular", "roughness", "normal")
+    priors = [
+        network_prior(m, {k: np.full((2, 2), s, np.float32) for k in names})
+        for m, s in zip(maps, (0.01, 0.02), strict=True)
+    ]
+    both = pooled(priors)
+    assert both.mean[..., 0] == pytest.approx(0.2 + 0.3 * 0.2)  # weights 4 : 1
+    assert (both.sigma[..., 0] > 0.01).all() and (both.sigma[..., 0] < 0.02).all()
+
+
+def test_turn_is_found():
+    maps = procedural_material(2, 64, 64, kind="bricks")
+    for k in range(4):
+        assert find_turn(turn_maps(maps, k), maps) == k
+    plain = constant_maps(8, 8)
+    assert find_turn(plain, plain) == 0
+
+
+def test_bands_give_what_the_whole_gives(prepared, environment, monkeypatch):
+    truth = procedural_material(7, SIZE, SIZE)
+    shots, prior = [Shot(photo_of(truth, environment), prepared)], wrong_by(truth, 1)
+    whole = refine(shots, prior, iterations=2), correct(shots, prior)
+    monkeypatch.setattr(refinement, "BAND", 5 * SIZE)
+    parts = refine(shots, prior, iterations=2), correct(shots, prior)
+    for a, b in zip(whole, parts, strict=True):
+        assert max(map_errors(a.maps, b.maps).values()) < 1e-3
+        np.testing.assert_allclose(a.sigma, b.sigma, atol=1e-3)
+        assert a.history[0]["photo_error"] == pytest.approx(b.history[0]["photo_error"])
+
+
+def test_interrupt_keeps_the_best_so_far(prepared, environment):
+    truth = constant_maps(SIZE, SIZE, 0.5, 0.04, 0.5)
+    prior = lobe_prior(constant_maps(SIZE, SIZE, 0.45, 0.04, 0.5))
+
+    def stop(step, error):
+        if step == 1:
+            raise KeyboardInterrupt
+
+    result = refine([Shot(photo_of(truth, environment), prepared)], prior, progress=stop)
+    assert result.interrupted and not result.converged
+    error = np.abs(result.maps.diffuse - truth.diffuse).mean()
+    assert error < np.abs(prior.mean[..., :3] - truth.diffuse).mean()

@@ -1,0 +1,116 @@
+"""Simulated captures to judge refinement by: whole path-traced photographs of held-out materials.
+
+Half of the photos are linear EXR, half JPEG of 8 bits, exposed for the screen. The screen hangs a
+few millimetres and degrees from where ``rig.toml`` says; the camera stands where it says.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from invrender.environments import (
+    find_environments,
+    procedural_environment,
+    read_environment,
+    rotate_environment,
+    scale_environment,
+)
+from invrender.images import linear_to_srgb, read_image, write_exr
+from invrender.maps import Maps
+from invrender.materials import (
+    crop_maps,
+    find_materials,
+    procedural_material,
+    read_material,
+    resize_maps,
+    turn_maps,
+)
+from invrender.pattern import default_pattern
+from invrender.rig import Rig
+from invrender.simulate import simulate
+
+HOLDOUT = Path(__file__).parents[1] / "nets" / "holdout.txt"
+FIRST_SEED = 90_000  # of procedural materials and rooms that nothing else uses
+GAIN = 2.0  # radiance of the screen's white
+SHIFT, TILT = 3e-3, 3.0  # standard deviations, metres and degrees, of the screen's pose
+
+
+def held_out(materials: Path | None, rooms: Path | None) -> tuple[list[Path], list[Path]]:
+    """Folders of materials and files of rooms whose names the networks never trained on."""
+    names = {line.strip() for line in HOLDOUT.read_text().splitlines() if line[:1] != "#"}
+    return (
+        [p for p in find_materials(materials) if p.name in names] if materials else [],
+        [p for p in find_environments(rooms) if p.stem in names] if rooms else [],
+    )
+
+
+def make_captures(
+    out: Path, count: int, size: int, width: int, spp: int,
+    materials: Path | None = None, rooms: Path | None = None,
+) -> list[Path]:  # fmt: skip
+    """Capture folders ``out``/000 and so on; simulates those that are not there yet.
+
+    size: pixels a side of the maps; width: of the photos; spp: path tracer's samples. Without
+    folders, materials and rooms are procedural. Capture k depends on k and these alone.
+    """
+    found, found_rooms = held_out(materials, rooms)
+    folders = [out / f"{k:03d}" for k in range(count)]
+    for k, folder in enumerate(folders):
+        if folder.exists():
+            continue
+        rng = np.random.default_rng(FIRST_SEED + k)
+        if found:
+            maps = _material(found, k, size)
+        else:
+            maps = procedural_material(FIRST_SEED + k, size, size)
+        if found_rooms:
+            n = len(found_rooms)
+            room = read_environment(found_rooms[(k + k // n) % n], 256)
+            room = rotate_environment(room, float(rng.uniform(0, 2 * np.pi)))
+        else:
+            room = procedural_environment(FIRST_SEED + k, 256)
+        room = scale_environment(room, float(rng.uniform(0.1, 1.0)))
+        shift = np.clip(rng.normal(0, SHIFT, 3), -2 * SHIFT, 2 * SHIFT)
+        tilt = np.clip(rng.normal(0, TILT, 3), -2 * TILT, 2 * TILT)
+        rig = Rig(screen_shift=tuple(shift.tolist()), screen_tilt=tuple(tilt.tolist()))
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=out, prefix=".") as name:
+            new = Path(name) / "capture"
+            simulate(
+                new, maps, room, default_pattern(), rig,
+                gain=GAIN, width=width, spp=spp, noise=0.005, seed=k,
+            )  # fmt: skip
+            if k % 2:
+                to_jpeg(new, int(rng.integers(85, 97)))
+            os.replace(new, folder)
+    return folders
+
+
+def _material(folders: list[Path], k: int, size: int) -> Maps:
+    """The k-th material, whole; another part of it, turned, when its turn comes again."""
+    maps = read_material(folders[k % len(folders)])
+    again = k // len(folders)
+    if again:
+        h, w = maps.shape
+        maps = crop_maps(maps, h // 4 * (again % 2), w // 4 * (again % 2), h * 3 // 4, w * 3 // 4)
+        maps = turn_maps(maps, again)
+    return resize_maps(maps, size, size)
+
+
+def to_jpeg(folder: Path, quality: int) -> None:
+    """Turn a capture's photo into a JPEG in which the screen's image in the ball just fits."""
+    photo = read_image(folder / "photo.exr")
+    scale = np.float32(0.9 / (0.9 * GAIN))
+    data = (linear_to_srgb(np.clip(photo * scale, 0, 1)) * 255 + 0.5).astype(np.uint8)
+    with io.BytesIO() as file:
+        Image.fromarray(data).save(file, "JPEG", quality=quality)
+        (folder / "photo.jpg").write_bytes(file.getvalue())
+    (folder / "photo.exr").unlink()
+    room = folder / "truth" / "environment.exr"
+    write_exr(room, read_image(room) * scale, half=True)

@@ -1,0 +1,51 @@
+"""Several photos of one sample: how each saw it turned, and the lights of all in one frame."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from invrender.environments import rotate_environment
+from invrender.maps import Maps, map_errors
+from invrender.materials import turn_maps
+from invrender.rig import Array, Rig
+
+CLEARLY = 0.9  # how much nearer the turned maps must be
+
+
+def find_turn(maps: Maps, first: Maps) -> int:
+    """Quarters, counter-clockwise, by which the sample lies turned against the first photo's.
+
+    maps, first: what either photo alone gave, in its own frame. A sample that looks the same from
+    all sides counts as not turned.
+    """
+    errors = [map_errors(turn_maps(maps, -k), first)["average"] for k in range(4)]
+    best = int(np.argmin(errors))
+    return best if errors[best] < CLEARLY * errors[0] else 0
+
+
+def turned_rig(rig: Rig, quarters: int) -> Rig:
+    """Screen and camera turned about the sample's normal, counter-clockwise.
+
+    It is for the forward model alone: the ball stays, and photos are not taken along.
+    """
+    turn = Rotation.from_rotvec([0, 0, 90 * quarters], degrees=True)
+    e_x, e_y = rig.screen_edges
+    centre = rig.screen_corner + e_x / 2 + e_y / 2
+    nominal = centre - np.asarray(rig.screen_shift)
+    tilt = turn * Rotation.from_rotvec(rig.screen_tilt, degrees=True)
+    shift = turn.apply(centre) - nominal
+    camera = turn.apply(rig.camera) - (rig.camera - np.asarray(rig.camera_shift))
+    return replace(
+        rig,
+        screen_shift=tuple(shift.tolist()),
+        screen_tilt=tuple(tilt.as_rotvec(degrees=True).tolist()),
+        camera_shift=tuple(camera.tolist()),
+    )
+
+
+def turned_environment(environment: Array, quarters: int) -> Array:
+    """The surroundings turned about the zenith, counter-clockwise; (H, 2H, 3)."""
+    return rotate_environment(environment, quarters % 4 * np.pi / 2)

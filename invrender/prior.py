@@ -1,0 +1,103 @@
+"""What is known of the maps before the photo is fitted, as a Gaussian a pixel.
+
+A pixel's nine parameters are θ = (k_d, k_s, ρ, slopes p and q of n ∝ (p, q, 1)), an image of them
+(H, W, 9).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from invrender.maps import Maps
+
+Array = NDArray[np.floating[Any]]
+D, S, R, N = slice(0, 3), slice(3, 6), 6, slice(7, 9)  # places of the parameters in θ
+
+MIN_ROUGHNESS = 0.03
+MAX_SLOPE = 3.0  # 72 degrees
+
+
+@dataclass
+class Prior:
+    """mean, sigma: (H, W, 9) in the order of θ; correlation: (9, 9), of the deviations."""
+
+    mean: Array
+    sigma: Array
+    correlation: Array
+
+
+def lobe_prior(maps: Maps) -> Prior:
+    """The uncertainty within a material of maps from `invrender.lobes`: mostly shade and relief."""
+    mean = to_theta(maps)
+    sigma = np.zeros_like(mean)
+    metal = np.clip((maps.specular - 0.06) / 0.3, 0, 1)
+    sigma[..., D] = 0.01 + 0.05 * maps.diffuse
+    sigma[..., S] = 0.002 + 0.05 * metal
+    sigma[..., R], sigma[..., N] = 0.02, 0.05
+    return Prior(mean, sigma, _correlation(0.98, 0.95))
+
+
+def network_prior(maps: Maps, sigma: dict[str, Array]) -> Prior:
+    """The uncertainty of a network's maps, from what it expects of its errors, (H, W) a map.
+
+    ``sigma`` of normals is that of n/2 + 1/2. An albedo's error within a material is at most a
+    share of it.
+    """
+    mean = to_theta(maps)
+    spread = np.empty_like(mean)
+    spread[..., D] = np.minimum(sigma["diffuse"][..., None], 0.01 + 0.15 * maps.diffuse)
+    spread[..., S] = np.minimum(sigma["specular"][..., None], 0.01 + 0.3 * maps.specular)
+    spread[..., R] = sigma["roughness"]
+    spread[..., N] = 2 * sigma["normal"][..., None]
+    return Prior(mean, np.maximum(spread, 1e-4), _correlation(0.9, 0.95))
+
+
+def _correlation(diffuse: float, specular: float) -> Array:
+    """(9, 9): an albedo's channels vary together."""
+    correlation = np.eye(9)
+    for k, r in ((D, diffuse), (S, specular)):
+        correlation[k, k] = r + (1 - r) * np.eye(3)
+    return correlation.astype(np.float32)
+
+
+def pooled(priors: Sequence[Prior]) -> Prior:
+    """What several photos' priors of the same sample tell together: means weighted by precision.
+
+    A network errs on a material in much the same way from every photo, so the expected error does
+    not fall with their number: it is that of the mean precision.
+    """
+    if len(priors) == 1:
+        return priors[0]
+    precision = [1 / p.sigma**2 for p in priors]
+    total = np.sum(precision, 0)
+    mean = np.sum([w * p.mean for w, p in zip(precision, priors, strict=True)], 0) / total
+    return Prior(mean, np.sqrt(len(priors) / total), priors[0].correlation)
+
+
+def to_theta(maps: Maps) -> Array:
+    """θ (H, W, 9) of maps."""
+    slopes = maps.normal[..., :2] / np.maximum(maps.normal[..., 2:], 0.1)
+    parts = [maps.diffuse, maps.specular, maps.roughness[..., None], slopes]
+    return project(np.concatenate(parts, -1).astype(np.float32))
+
+
+def to_maps(theta: Array) -> Maps:
+    """Maps of θ."""
+    normal = np.concatenate([theta[..., N], np.ones_like(theta[..., :1])], -1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    parts = (theta[..., D], theta[..., S], theta[..., R], normal)
+    return Maps(*(np.ascontiguousarray(p, dtype=np.float32) for p in parts))
+
+
+def project(theta: Array) -> Array:
+    """θ within its physical range, in place."""
+    theta[..., :6] = np.clip(theta[..., :6], 0, 1)
+    theta[..., R] = np.clip(theta[..., R], MIN_ROUGHNESS, 1)
+    slope = np.linalg.norm(theta[..., N], axis=-1, keepdims=True)
+    theta[..., N] *= np.minimum(1, MAX_SLOPE / np.maximum(slope, 1e-9))
+    return theta
