@@ -3,135 +3,262 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from invrender.ball import find_ball
-from invrender.capture import crop_sample, extract_lights, load_capture
+from invrender.capture import Capture, Lights, crop_sample, extract_lights, load_capture
 from invrender.errors import InputError
 from invrender.images import Photo
-from invrender.maps import map_errors
-from invrender.materials import resize_maps
+from invrender.maps import Maps, map_errors
+from invrender.materials import resize_maps, turn_maps
+from invrender.mirror import Ball
 from invrender.results import Report, write_results
 from invrender.rig import Rig
 
+if TYPE_CHECKING:  # Dr.Jit compiles where the refinement is imported
+    from invrender.refine import Refined
+
 Array = NDArray[np.floating[Any]]
 FINAL_SAMPLES = 256
+POOR_FIT = 0.3  # photo error from which the maps are in doubt
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a capture tells before its maps: the lights, and the sample as its photo shows it.
+
+    photo: (size, size, 3), linear radiance; clipped: (size, size), where it is saturated. ball:
+    None where the lights were known without one.
+    """
+
+    capture: Capture
+    ball: Ball | None
+    lights: Lights
+    photo: Array
+    clipped: NDArray[np.bool_]
+
+    def prepare(self, turn: int = 0) -> Any:
+        """The forward model of these lights, turned by quarters about the sample's normal."""
+        from invrender.joint import turned_environment, turned_rig
+        from invrender.render import make_scene, prepare
+
+        rig, room = self.lights.rig, self.lights.environment
+        if turn % 4:
+            rig, room = turned_rig(rig, turn), turned_environment(room, turn)
+        dark = not room.any()
+        return prepare(
+            make_scene(rig, self.lights.pattern, None if dark else room, self.lights.gain)
+        )
+
+
+class Stages:
+    """Seconds by the name of each stage, told to ``progress`` as they begin."""
+
+    def __init__(self, progress: Callable[[str], None] = lambda stage: None) -> None:
+        self.seconds: dict[str, float] = {}
+        self.progress = progress
+
+    @contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        self.progress(name)
+        began = time.perf_counter()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
+
+
+def see(
+    folder: Path,
+    size: int,
+    stage: Stages,
+    *,
+    ball: tuple[float, float, float] | None = None,
+    environment: Array | None = None,
+    gain: Any = None,
+) -> Seen:
+    """Read a capture, find its lights and cut out its sample, ``size`` pixels a side.
+
+    environment: the room's radiance (H, 2H, 3) in the photo's unit, if it is known; noughts for a
+    dark room. gain: of the screen, likewise. With both, no ball is looked for.
+    """
+    with stage("read"):
+        capture = load_capture(folder)
+    found = None
+    if environment is not None and gain is not None:
+        lights = _known_lights(capture, environment, gain)
+    else:
+        with stage("ball"):
+            found = find_ball(capture.photo, capture.rig, ball)
+        with stage("lights"):
+            lights = extract_lights(capture, found)
+        if environment is not None:
+            lights = replace(lights, environment=environment)
+        if gain is not None:
+            lights = replace(lights, gain=_rgb(gain))
+    with stage("crop"):
+        photo = crop_sample(capture.photo, lights.rig, size)
+        clipped = crop_mask(capture.photo, lights.rig, size)
+    return Seen(capture, found, lights, photo, clipped)
+
+
+def _rgb(gain: Any) -> Array:
+    return np.broadcast_to(np.asarray(gain, np.float32), 3).copy()
+
+
+def _known_lights(capture: Capture, environment: Array, gain: Any) -> Lights:
+    """Lights that a person states: the pattern is taken to be shown as it should be."""
+    covered = np.ones(environment.shape[:2], np.float32)
+    shown = (capture.pattern * _rgb(gain)).astype(np.float32)
+    return Lights(environment, covered, capture.pattern, _rgb(gain), shown, capture.rig)
+
+
+def recover(
+    seen: Sequence[Seen],
+    stage: Stages,
+    *,
+    init: str = "network",
+    samples: int = 64,
+) -> tuple[Maps, Refined, list[Any]]:
+    """Initial and refined maps of one sample from one or more photos, and the photos' lights.
+
+    Several are solved jointly, in the first one's frame; the lights come back as the forward model
+    of each, prepared in that frame.
+    """
+    with stage("read"):
+        reconstruct = _network() if init == "network" else None
+    with stage("forward model"):
+        # Dr.Jit compiles here; nothing before needs it.
+        from invrender.initial import flat_maps
+        from invrender.joint import find_turn
+        from invrender.lobes import fit_lobes
+        from invrender.prior import lobe_prior, network_prior, pooled
+        from invrender.refine import Shot, correct, refine
+
+        shots = [Shot(s.photo, s.prepare(), s.clipped if s.clipped.any() else None) for s in seen]
+    if reconstruct is None:
+        with stage("initial maps"):
+            starts = [flat_maps(s.photo, s.prepared, samples) for s in shots]
+        with stage("materials"):
+            own = [fit_lobes(s.photo, s.prepared, samples) for s in shots]
+        turns = [0] + [find_turn(m, starts[0]) for m in starts[1:]]
+        prior = lobe_prior(own[0])
+    else:
+        with stage("initial maps"):
+            estimates = [
+                reconstruct(
+                    s.photo, s.lights.rig, s.lights.pattern, s.lights.gain,
+                    s.lights.environment if s.lights.environment.any() else None,
+                    s.lights.pattern_captured,
+                )
+                for s in seen
+            ]  # fmt: skip
+        starts = [e.maps for e in estimates]
+        turns = [0] + [find_turn(m, starts[0]) for m in starts[1:]]
+        priors = [
+            network_prior(turn_maps(e.maps, -k), {n: np.rot90(x, -k) for n, x in e.sigma.items()})
+            for e, k in zip(estimates, turns, strict=True)
+        ]
+        prior = pooled(priors)
+    with stage("forward model"):
+        shots = [
+            shot if k == 0 else _turned(s, k) for shot, s, k in zip(shots, seen, turns, strict=True)
+        ]
+    with stage("refine"):
+        if reconstruct is None:
+            result = refine(
+                shots, prior, samples=samples,
+                progress=lambda i, e: stage.progress(f"refine: step {i}, photo error {e:.4f}"),
+            )  # fmt: skip
+        else:
+            result = correct(shots, prior, samples=samples)
+    return starts[0], result, shots
+
+
+def _turned(seen: Seen, quarters: int) -> Any:
+    """The shot in the frame of a photo that shows the sample ``quarters`` less turned."""
+    from invrender.refine import Shot
+
+    clipped = np.rot90(seen.clipped, -quarters) if seen.clipped.any() else None
+    photo = np.ascontiguousarray(np.rot90(seen.photo, -quarters))
+    return Shot(photo, seen.prepare(-quarters), clipped)
 
 
 def refine_capture(
     folder: Path,
     out: Path,
     *,
+    more: Sequence[Path] = (),
     size: int = 256,
     init: str = "network",
     samples: int = 64,
     ball: tuple[float, float, float] | None = None,
+    environment: Array | None = None,
+    gain: Any = None,
     progress: Callable[[str], None] = lambda stage: None,
 ) -> Report:
     """Recover the maps of a capture and write them, with lights, pictures and report, to ``out``.
 
-    size: pixels a side of the maps. init: where refinement starts, "network" or "flat" (needs no
-    torch). Raises `InputError` for bad input, before anything is written.
+    more: other captures of the same sample, solved jointly with the first, whose frame, lights and
+    pictures are written. size: pixels a side of the maps. init: where refinement starts, "network"
+    or "flat" (needs no torch). environment, gain: as for `see`. Raises `InputError` for bad input,
+    before anything is written. Ctrl-C during the refinement writes the best maps so far, and is
+    raised again.
     """
-    folder, out = Path(folder), Path(out)
+    folders, out = [Path(folder), *map(Path, more)], Path(out)
     if size < 1:
         raise InputError(f"the size must be at least one pixel, got {size}")
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} is a file; choose a folder for the results")
-    seconds: dict[str, float] = {}
-
-    @contextmanager
-    def stage(name: str) -> Iterator[None]:
-        progress(name)
-        began = time.perf_counter()
-        yield
-        seconds[name] = time.perf_counter() - began
-
-    with stage("read"):
-        capture = load_capture(folder)
-        reconstruct = _network() if init == "network" else None
-    with stage("ball"):
-        found = find_ball(capture.photo, capture.rig, ball)
-    with stage("lights"):
-        lights = extract_lights(capture, found)
-    with stage("crop"):
-        rig = lights.rig
-        photo = crop_sample(capture.photo, rig, size)
-        clipped = crop_mask(capture.photo, rig, size)
-    with stage("forward model"):
-        # Dr.Jit compiles here; nothing before needs it.
-        from invrender.initial import flat_maps
-        from invrender.lobes import fit_lobes
-        from invrender.refine import correct, lobe_prior, network_prior, refine
-        from invrender.render import make_scene, prepare, render
-
-        scene = make_scene(rig, lights.pattern, lights.environment, lights.gain)
-        prepared = prepare(scene)
-    if reconstruct is None:
-        with stage("initial maps"):
-            start = flat_maps(photo, prepared, samples)
-        with stage("materials"):
-            prior = lobe_prior(fit_lobes(photo, prepared, samples))
-    else:
-        with stage("initial maps"):
-            estimate = reconstruct(
-                photo, rig, lights.pattern, lights.gain, lights.environment,
-                lights.pattern_captured,
-            )  # fmt: skip
-            start, prior = estimate.maps, network_prior(estimate.maps, estimate.sigma)
-    with stage("refine"):
-        seen = clipped if clipped.any() else None
-        if reconstruct is None:
-            result = refine(
-                photo, prepared, prior, samples=samples, clipped=seen,
-                progress=lambda i, error: progress(f"refine: step {i}, photo error {error:.4f}"),
-            )  # fmt: skip
-        else:
-            result = correct(photo, prepared, prior, samples=samples, clipped=seen)
+    stage = Stages(progress)
+    seen = [see(f, size, stage, ball=ball, environment=environment, gain=gain) for f in folders]
+    start, result, shots = recover(seen, stage, init=init, samples=samples)
+    first = seen[0]
     with stage("render"):
-        pictures = [
-            render(
-                rig, maps, lights.pattern, lights.environment, lights.gain,
-                samples=FINAL_SAMPLES,
-            )
-            for maps in (start, result.maps)
-        ]  # fmt: skip
-    before, after = (_photo_error(p, photo, clipped) for p in pictures)
+        from invrender.render import picture
+
+        lights = shots[0].prepared
+        pictures = [picture(lights, maps, FINAL_SAMPLES) for maps in (start, result.maps)]
+    before, after = (_photo_error(p, first.photo, first.clipped) for p in pictures)
     errors = None
-    if capture.truth is not None:
-        truth = resize_maps(capture.truth, size, size)
+    if first.capture.truth is not None:
+        truth = resize_maps(first.capture.truth, size, size)
         errors = {"initial": map_errors(start, truth), "refined": map_errors(result.maps, truth)}
     report = Report(
-        capture=folder.name,
+        capture=" + ".join(f.name for f in folders),
         size=size,
         init=init,
-        sample_size=rig.sample_size,
-        seconds=seconds,
+        sample_size=first.lights.rig.sample_size,
+        seconds=stage.seconds,
         photo_error={"initial": before, "refined": after},
         converged=result.converged,
         history=result.history,
-        capture_fit={
-            "ball_centre": list(found.centre),
-            "ball_radius": found.radius,
-            "ball_confidence": found.confidence,
-            "gain": [float(g) for g in lights.gain],
-            **lights.fit,
-        },
-        warnings=_warnings(clipped, result.converged),
+        capture_fit=_capture_fit(first),
+        warnings=_warnings(first.clipped, after, result),
         map_error=errors,
         versions={n: version(n) for n in ("invrender", "drjit", "mitsuba", "numpy")},
     )
     with stage("write"):
-        write_results(out, report, lights, result, photo, pictures[1])
+        write_results(out, report, first.lights, result, first.photo, pictures[1])
+    if result.interrupted:
+        raise KeyboardInterrupt(f"interrupted; {out} holds the best maps so far")
     return report
+
+
+def _capture_fit(seen: Seen) -> dict[str, Any]:
+    fit: dict[str, Any] = {"gain": [float(g) for g in seen.lights.gain], **seen.lights.fit}
+    if seen.ball is not None:
+        fit["ball_centre"] = list(seen.ball.centre)
+        fit["ball_radius"] = seen.ball.radius
+        fit["ball_confidence"] = seen.ball.confidence
+    return fit
 
 
 def _network() -> Any:
@@ -161,13 +288,20 @@ def _photo_error(picture: Array, photo: Array, clipped: NDArray[np.bool_]) -> fl
     return float(np.sqrt(np.mean(difference**2)) / max(float(photo[seen].mean()), 1e-12))
 
 
-def _warnings(clipped: NDArray[np.bool_], converged: bool) -> list[str]:
+def _warnings(clipped: NDArray[np.bool_], error: float, result: Refined) -> list[str]:
     warnings = []
     if clipped.any():
         warnings.append(
             f"{clipped.mean():.1%} of the sample is saturated in the photo; the maps keep their "
             "initial values there: expose for the highlights"
         )
-    if not converged:
+    if result.interrupted:
+        warnings.append("interrupted: these are the best maps so far")
+    elif not result.converged:
         warnings.append("refinement had not converged when it reached its step limit")
+    if error > POOR_FIT:
+        warnings.append(
+            f"the maps explain the photo only to within {error:.0%} of its mean: check the rig's "
+            "sizes, the pattern and the ball"
+        )
     return warnings
