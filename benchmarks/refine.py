@@ -1,143 +1,185 @@
-"""Refinement on simulated captures: photo and map errors before and after, and their cost.
+"""Refinement on simulated captures: maps, re-rendering, uncertainty and time, before and after.
 
     python benchmarks/refine.py [--quick] --out DIR [--materials DIR --envs DIR]
 
-Whole photographs are path-traced (ball, table and inter-reflection included) and every capture is
-refined from its photo alone, with estimated lights. Without folders, materials and rooms are
-procedural, from seeds that nothing else uses.
+Whole photographs are path-traced (`refine_captures`) and every capture is refined from its photo
+alone, with estimated lights; from the network's maps and, beside it, from a flat start. Captures
+are kept in DIR/captures: a rerun only refines. Without folders, materials and rooms are procedural.
 """
 
 from __future__ import annotations
 
 import argparse
+import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from common import bar, markdown, write_results
 from matplotlib import pyplot as plt
+from refine_captures import make_captures
 
-from invrender.environments import (
-    find_environments,
-    procedural_environment,
-    read_environment,
-    rotate_environment,
-    scale_environment,
-)
-from invrender.maps import NAMES
-from invrender.materials import find_materials, procedural_material, read_material, resize_maps
-from invrender.pattern import default_pattern
-from invrender.pipeline import refine_capture
-from invrender.rig import Rig
-from invrender.simulate import simulate
+from invrender.maps import NAMES, Maps, map_errors
+from invrender.materials import resize_maps
+from invrender.pipeline import Stages, recover, see
+from invrender.relight import rerender
+from invrender.results import deviations
 
-FIRST_SEED = 90_000
+INITS = ("network", "flat")
+SURE = 0.68  # of a Gaussian within one sigma
 
 
-def make_captures(args: argparse.Namespace) -> list[Path]:
-    """Simulate the captures that are not there yet."""
-    materials = find_materials(args.materials) if args.materials else []
-    rooms = find_environments(args.envs) if args.envs else []
-    folders = []
-    for k in range(args.count):
-        rng = np.random.default_rng(FIRST_SEED + k)
-        folder = args.out / "captures" / f"{k:03d}"
-        folders.append(folder)
-        if folder.exists():
-            continue
-        if materials:
-            maps = read_material(materials[int(rng.integers(len(materials)))])
-        else:
-            maps = procedural_material(FIRST_SEED + k, args.size, args.size)
-        if rooms:
-            room = read_environment(rooms[int(rng.integers(len(rooms)))], 256)
-            room = rotate_environment(room, float(rng.uniform(0, 2 * np.pi)))
-        else:
-            room = procedural_environment(FIRST_SEED + k, 256)
-        simulate(
-            folder,
-            resize_maps(maps, args.size, args.size),
-            scale_environment(room, float(rng.uniform(0.1, 1.0))),
-            default_pattern(),
-            Rig(),
-            gain=2.0,
-            width=args.width,
-            spp=args.spp,
-            noise=0.005,
-            seed=k,
-        )
-    return folders
+def rerender_error(maps: Maps, truth: Maps) -> float:
+    """RMSE under nine point lights, as displayed."""
+    return float(np.sqrt(np.mean((rerender(maps) - rerender(truth)) ** 2, dtype=np.float64)))
+
+
+def coverage(maps: Maps, truth: Maps, sigma: dict[str, Any]) -> dict[str, float]:
+    """Share of the truth within one standard deviation; of normals x and y, encoded."""
+    found, true = maps.encoded(), truth.encoded()
+    shares = {}
+    for name, s in sigma.items():
+        a, b = (x[name][..., :2] if name == "normal" else x[name] for x in (found, true))
+        s = s[..., None] if a.ndim > s.ndim else s
+        shares[name] = float((np.abs(a - b) <= s).mean())
+    return shares
+
+
+def measure(folder: Path, size: int, init: str) -> dict[str, Any]:
+    """Refine a capture and compare with its truth."""
+    stage = Stages()
+    cpu = time.process_time()
+    seen = see(folder, size, stage)
+    start, result, _ = recover([seen], stage, init=init)
+    cpu = time.process_time() - cpu
+    assert seen.capture.truth is not None
+    truth = resize_maps(seen.capture.truth, size, size)
+    done = sum(stage.seconds.values())
+    shares = coverage(result.maps, truth, deviations(result.sigma))
+    row: dict[str, Any] = {
+        "capture": folder.name,
+        "seconds_initial": done - stage.seconds["refine"] - stage.seconds.get("materials", 0.0),
+        "seconds_refined": done,
+        "processor_seconds": cpu,
+        "stages": stage.seconds,
+        "coverage": shares,
+        "covered": float(np.mean(list(shares.values()))),
+        "converged": result.converged,
+    }
+    for when, maps in (("initial", start), ("refined", result.maps)):
+        for name, error in map_errors(maps, truth).items():
+            row[f"{name}_{when}"] = error
+        row[f"rerender_{when}"] = rerender_error(maps, truth)
+    return row
+
+
+def pooled(rows: list[dict[str, Any]], name: str) -> float:
+    """RMSE over all captures together; ``average`` is the mean of the four maps' (design, 8)."""
+    kind, when = name.rsplit("_", 1)
+    if kind == "average":
+        return float(np.mean([pooled(rows, f"{n}_{when}") for n in NAMES]))
+    return float(np.sqrt(np.mean([r[name] ** 2 for r in rows])))
+
+
+def summarise(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Pooled errors before and after, and the medians of the times."""
+    errors = {
+        n: [pooled(rows, f"{n}_initial"), pooled(rows, f"{n}_refined")]
+        for n in (*NAMES, "average", "rerender")
+    }
+    better = [r["average_refined"] < r["average_initial"] for r in rows]
+    shares = {n: float(np.mean([r["coverage"][n] for r in rows])) for n in NAMES}
+    names = list(dict.fromkeys(n for r in rows for n in r["stages"]))
+    return {
+        "errors": errors,
+        "improved": float(np.mean(better)),
+        "coverage": shares,
+        "seconds": {
+            n: float(np.median([r[n] for r in rows]))
+            for n in ("seconds_initial", "seconds_refined", "processor_seconds")
+        },
+        "stages": {n: float(np.median([r["stages"].get(n, 0.0) for r in rows])) for n in names},
+    }
+
+
+def bars(summary: dict[str, Any]) -> list[dict[str, Any]]:
+    """The bars of refining the network's maps."""
+    ratio = {n: after / before for n, (before, after) in summary["errors"].items()}
+    covered = float(np.mean(list(summary["coverage"].values())))
+    return [
+        bar("average map RMSE, refined over network", ratio["average"], 0.9, at_least=False),
+        bar("share of captures improved", summary["improved"], 0.8, at_least=True),
+        bar("worst map, refined over network", max(ratio[n] for n in NAMES), 1, at_least=False),
+        bar("re-render RMSE, refined over network", ratio["rerender"], 0.8, at_least=False),
+        bar("seconds, median", summary["seconds"]["seconds_refined"], 20, at_least=False),
+        bar("coverage's distance from 68%", abs(covered - SURE), 0.08, at_least=False),
+    ]
+
+
+def plot(results: dict[str, list[dict[str, Any]]], file: Path) -> None:
+    """Map and re-render error against run time: a thin line a capture, a thick one for all."""
+    figure, axes = plt.subplots(1, 2, figsize=(10, 4))
+    for axis, name in zip(axes, ("average", "rerender"), strict=True):
+        for colour, (init, rows) in zip(("C0", "C1"), results.items(), strict=False):
+            for row in rows:
+                x = [row["seconds_initial"], row["seconds_refined"]]
+                axis.plot(x, [row[f"{name}_{w}"] for w in ("initial", "refined")], colour, lw=0.4)
+            s = summarise(rows)
+            x = [s["seconds"]["seconds_initial"], s["seconds"]["seconds_refined"]]
+            axis.plot(x, s["errors"][name], colour, marker="o", lw=2.5, label=init)
+        axis.set(xscale="log", yscale="log", xlabel="seconds", ylabel=f"{name} RMSE")
+        axis.legend()
+    figure.tight_layout()
+    figure.savefig(file, dpi=110)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--quick", action="store_true", help="two small captures, under a minute")
-    parser.add_argument("--materials", type=Path, help="folder of materials")
-    parser.add_argument("--envs", type=Path, help="folder of environments")
-    parser.add_argument("--count", type=int, default=8)
-    parser.add_argument("--init", choices=["network", "flat"], default="network")
+    parser.add_argument("--materials", type=Path, help="folder of materials; the held-out are used")
+    parser.add_argument("--envs", type=Path, help="folder of environments; the held-out are used")
+    parser.add_argument("--count", type=int, default=24)
+    parser.add_argument("--init", choices=INITS, action="append", help="only this start")
     args = parser.parse_args()
-    args.count = 2 if args.quick else args.count
-    args.size, args.width, args.spp = (96, 480, 8) if args.quick else (256, 960, 32)
-    args.out.mkdir(parents=True, exist_ok=True)
-
-    rows: list[dict[str, Any]] = []
-    for folder in make_captures(args):
-        report = refine_capture(
-            folder, args.out / "results" / folder.name, size=args.size, init=args.init
-        )
-        assert report.map_error is not None
-        rows.append(
-            {
-                "capture": folder.name,
-                "seconds": sum(report.seconds.values()),
-                "photo_initial": report.photo_error["initial"],
-                "photo_refined": report.photo_error["refined"],
-                **{f"{n}_initial": v for n, v in report.map_error["initial"].items()},
-                **{f"{n}_refined": v for n, v in report.map_error["refined"].items()},
-            }
-        )
-        print({k: round(v, 4) if isinstance(v, float) else v for k, v in rows[-1].items()})
-
-    def total(name: str) -> float:
-        return float(np.sqrt(np.mean([r[name] ** 2 for r in rows])))
-
-    before, after = total("average_initial"), total("average_refined")
-    better = float(np.mean([r["average_refined"] < r["average_initial"] for r in rows]))
-    seconds = float(np.median([r["seconds"] for r in rows]))
-    photo = total("photo_refined") / total("photo_initial")
-    bars = [
-        bar("average map error, refined over initial", after / before, 1.0, at_least=False),
-        bar("share of captures with a lower average map error", better, 0.5, at_least=True),
-        bar("seconds a capture, median", seconds, 60.0, at_least=False),
-    ]
-
-    figure, axis = plt.subplots(figsize=(6, 4))
-    for row in rows:
-        axis.plot(
-            [0.1, row["seconds"]], [row["average_initial"], row["average_refined"]], "o-", ms=4
-        )
-    axis.set(xscale="log", yscale="log", xlabel="seconds", ylabel="average map RMSE")
-    axis.set_title("from initial to refined maps, one line a capture")
-    figure.tight_layout()
-    figure.savefig(args.out / "refine.png", dpi=120)
-    header = ["capture", "seconds", "photo error", *NAMES, "average"]
-    table = [
-        [
-            row["capture"],
-            row["seconds"],
-            *(
-                f"{row[f'{n}_initial']:.4f} → {row[f'{n}_refined']:.4f}"
-                for n in ("photo", *NAMES, "average")
-            ),
-        ]
-        for row in rows
-    ]
-    (args.out / "refine.md").write_text(markdown(header, table))
-    write_results(
-        args.out, {"rows": rows, "photo error, refined over initial": photo, "bars": bars}
+    count, size, width, spp = (2, 96, 480, 8) if args.quick else (args.count, 256, 960, 32)
+    folders = make_captures(
+        args.out / "captures", count, size, width, spp, args.materials, args.envs
     )
+
+    results: dict[str, list[dict[str, Any]]] = {}
+    for init in args.init or INITS:
+        rows = results[init] = []
+        for folder in folders:
+            rows.append(measure(folder, size, init))
+            r = rows[-1]
+            print(
+                f"{init} {folder.name}: maps {r['average_initial']:.4f} →"
+                f" {r['average_refined']:.4f}, re-render {r['rerender_initial']:.4f} →"
+                f" {r['rerender_refined']:.4f}, {r['seconds_refined']:.1f} s",
+                flush=True,
+            )
+    summaries = {init: summarise(rows) for init, rows in results.items()}
+    plot(results, args.out / "refine.png")
+    text = []
+    for init, s in summaries.items():
+        table = [[n, *e, e[1] / e[0], s["coverage"].get(n, "")] for n, e in s["errors"].items()]
+        header = [f"RMSE, {init}", "initial", "refined", "ratio", "within one sigma"]
+        text += [markdown(header, table), markdown(["stage", "s"], list(s["stages"].items()))]
+    for init, rows in results.items():
+        names = (*NAMES, "average", "rerender")
+        table = [
+            [
+                r["capture"],
+                r["seconds_refined"],
+                *(f"{r[f'{n}_initial']:.4f} → {r[f'{n}_refined']:.4f}" for n in names),
+            ]
+            for r in rows
+        ]
+        text.append(markdown([f"capture, {init}", "seconds", *names], table))
+    (args.out / "refine.md").write_text("\n".join(text))
+    reached = bars(summaries["network"]) if "network" in summaries else []
+    write_results(args.out, {"summaries": summaries, "rows": results, "bars": reached})
 
 
 if __name__ == "__main__":
