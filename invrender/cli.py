@@ -10,10 +10,14 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.logging import RichHandler
 
@@ -34,8 +38,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except InputError as error:
         Console(stderr=True).print(f"invrender: {error}", markup=False, highlight=False)
         return 2
-    except KeyboardInterrupt:
-        Console(stderr=True).print("invrender: interrupted, nothing was written")
+    except KeyboardInterrupt as stop:
+        text = str(stop) or "interrupted, nothing was written"
+        Console(stderr=True).print(f"invrender: {text}", markup=False, highlight=False)
         return 130
 
 
@@ -74,6 +79,19 @@ def _parser() -> argparse.ArgumentParser:
         type=_ball,
         metavar="X,Y,R",
         help="the ball's centre and radius in photo pixels, if it is not found by itself",
+    )
+    refine.add_argument(
+        "--environment",
+        metavar="FILE",
+        help="the room's light instead of the ball's: an equirectangular image in the photo's unit "
+        "of radiance, or 'none' for a dark room",
+    )
+    refine.add_argument(
+        "--gain",
+        type=_gain,
+        metavar="R,G,B",
+        help="the screen's radiance for white, one number or three, instead of the ball's; with "
+        "--environment the photo needs no ball",
     )
     refine.add_argument("--json", action="store_true", help="print the report as JSON")
     refine.set_defaults(run=_refine)
@@ -123,6 +141,16 @@ def _ball(text: str) -> tuple[float, float, float]:
     return x, y, r
 
 
+def _gain(text: str) -> tuple[float, ...]:
+    try:
+        values = tuple(float(v) for v in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) not in (1, 3) or not all(0 < v < math.inf for v in values):
+        raise argparse.ArgumentTypeError("expected one or three positive numbers: R,G,B")
+    return values
+
+
 def _refine(args: argparse.Namespace, console: Console) -> int:
     from invrender.pipeline import refine_capture
 
@@ -135,6 +163,8 @@ def _refine(args: argparse.Namespace, console: Console) -> int:
             init=args.init,
             samples=args.samples,
             ball=args.ball,
+            environment=_room(args.environment),
+            gain=args.gain,
             progress=lambda stage: status.update(f"{stage} …"),
         )
     if args.json:
@@ -157,6 +187,17 @@ def _refine(args: argparse.Namespace, console: Console) -> int:
     for warning in report.warnings:
         console.print(f"  warning: {warning}", markup=False, highlight=False)
     return 0
+
+
+def _room(name: str | None) -> NDArray[np.floating[Any]] | None:
+    """The environment that the option names; noughts for "none", None without the option."""
+    if name is None:
+        return None
+    if name == "none":
+        return np.zeros((8, 16, 3), np.float32)
+    from invrender.environments import read_environment
+
+    return read_environment(Path(name), 256)
 
 
 def _simulate(args: argparse.Namespace, console: Console) -> int:
