@@ -11,11 +11,10 @@ from __future__ import annotations
 
 import argparse
 import json
-import logging
 import os
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -24,33 +23,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from safetensors.numpy import save_file
-from scipy.ndimage import gaussian_filter
 
 from invrender.backend import dr
 from invrender.cluster import map_tasks
-from invrender.environments import (
-    find_environments,
-    procedural_environment,
-    read_environment,
-    rotate_environment,
-    scale_environment,
-)
+from invrender.environments import find_environments, scale_environment
 from invrender.errors import InputError
-from invrender.images import read_image
 from invrender.maps import Maps
-from invrender.materials import (
-    augment,
-    check_maps,
-    find_materials,
-    load_materials,
-    mix,
-    procedural_material,
-)
-from invrender.pattern import default_pattern
+from invrender.materials import find_materials
 from invrender.render import Tables, Unbiased, material_from_maps, prepare, radiance
-from invrender.rig import Rig
 from invrender.scene import make_scene, make_view
 from nets.clues import light_inputs, white_level
+from nets.draw import Options, draw_environment, draw_material, draw_rigs, light_pattern
 from nets.infer import estimate_of, linearised, predict
 from nets.loader import positions
 from nets.noise import (
@@ -62,162 +45,20 @@ from nets.noise import (
     sensor,
 )
 from nets.sheet import problems
-from nets.splitsum import area_resize
 from nets.store import load_weights
 
 Array = NDArray[np.floating[Any]]
 Sample = dict[str, Array]
-log = logging.getLogger("invrender")
 
 SHARD = 64
-HOLDOUT = Path(__file__).with_name("holdout.txt")
 RADIANCE = ("photo", "ideal", "env_clues", "active_clues", "sky", "screen", "ball", "pattern")
 FLOOR = 1e-4  # smallest white level of a usable capture, of the screen's white
-
-
-@dataclass(frozen=True)
-class Options:
-    """What is drawn. ``split``: train leaves the held-out names aside, holdout takes only them.
-
-    procedural: share of made-up materials and rooms where folders are given. per_room: captures in
-    the same room with the same rig. pattern: an image file, or the default pattern where empty.
-    network: weights; where given, captures are not for that network but for the correction of its
-    maps (`nets.correction`).
-    """
-
-    size: int = 128
-    samples: int = 32
-    seed: int = 0
-    split: str = "train"
-    materials: str = ""
-    envs: str = ""
-    procedural: float = 0.5
-    per_room: int = 2
-    env_height: int = 64
-    pattern: str = ""
-    network: str = ""
-
-
-# --- lights ---------------------------------------------------------------------------------------
-
-
-def light_pattern(path: str = "", size: int = 128) -> Array:
-    """The pattern (size, size, 3) from a file, or the default one."""
-    if path:
-        return area_resize(np.clip(read_image(Path(path)), 0, 1), size)
-    return default_pattern(size)
-
-
-def holdout_names() -> set[str]:
-    """Names in ``holdout.txt``."""
-    lines = HOLDOUT.read_text().splitlines()
-    return {line.strip() for line in lines if line.strip() and not line.startswith("#")}
-
-
-@lru_cache(maxsize=4)
-def _folder_materials(root: str, split: str) -> tuple[Maps, ...]:
-    """Usable materials of a folder that belong to a split, at most 512² each."""
-    if not root:
-        return ()
-    held = holdout_names()
-    wanted = lambda folder: (folder.name in held) == (split == "holdout")  # noqa: E731
-    return tuple(maps for _, maps in load_materials(Path(root), 512, wanted))
-
-
-@lru_cache(maxsize=4)
-def _folder_environments(root: str, split: str, height: int) -> tuple[Array, ...]:
-    held, out = holdout_names(), []
-    for path in find_environments(Path(root)) if root else []:
-        if (path.stem in held) != (split == "holdout"):
-            continue
-        try:
-            out.append(read_environment(path, height))
-        except (InputError, OSError, MemoryError) as e:
-            log.warning("%s left out: %s", path, e or type(e).__name__)
-    return tuple(out)
-
-
-def draw_material(rng: np.random.Generator, options: Options) -> Maps:
-    """A material of size × size, procedural or from the folder, at times two mixed."""
-    real = _folder_materials(options.materials, options.split)
-    n = options.size
-
-    def one() -> Maps:
-        if real and rng.random() >= options.procedural:
-            jitter = 0.0 if options.split == "holdout" else 1.0
-            return augment(real[rng.integers(len(real))], rng, n, n, jitter=jitter)
-        return procedural_material(int(rng.integers(2**62)), n, n)
-
-    for _ in range(20):
-        maps = one()
-        if options.split == "train" and rng.random() < 0.1 and n >= 8:
-            field = gaussian_filter(
-                rng.standard_normal((n, n)), n / rng.uniform(4, 16), mode="wrap"
-            )
-            edge = np.clip(0.5 + field / field.std() / rng.uniform(0.02, 0.5), 0, 1)
-            maps = mix(maps, one(), edge.astype(np.float32), float(rng.uniform(-1, 1)))
-        try:
-            check_maps(maps)
-        except InputError:
-            continue
-        return maps
-    raise InputError("twenty degenerate materials in a row")
-
-
-def draw_environment(rng: np.random.Generator, options: Options) -> Array:
-    """A room, turned at random, at a radiance of its own."""
-    real = _folder_environments(options.envs, options.split, options.env_height)
-    if real and rng.random() >= options.procedural:
-        env = real[rng.integers(len(real))]
-    else:
-        env = procedural_environment(int(rng.integers(2**62)), options.env_height)
-    if rng.random() < 0.5:
-        env = env[:, ::-1]
-    return rotate_environment(env, float(rng.uniform(0, 2 * np.pi)))
-
-
-def draw_rigs(rng: np.random.Generator) -> tuple[Rig, Rig]:
-    """(what the user measured or the ball showed, what it really is).
-
-    Only proportions matter to the picture, so the screen's size stays. Some rigs are held by hand:
-    shifted by up to a tenth of the sample and tilted by up to 10 degrees, and known to be.
-    """
-    d = Rig()
-
-    known = replace(
-        d,
-        screen_height=d.screen_height * float(np.exp(0.03 * rng.standard_normal())),
-        camera_offset=float(max(d.camera_offset + 0.001 * rng.standard_normal(), 0.01)),
-    )
-    if rng.random() < 0.35:
-        loose = float(rng.uniform(0, 1))
-        shift = loose * 0.1 * d.sample_size * rng.uniform(-1, 1, 3) * (1, 1, 0.5)
-        tilt = loose * 10 * rng.uniform(-1, 1, 3)
-        known = replace(known, screen_shift=_vec3(shift), screen_tilt=_vec3(tilt))
-    if rng.random() < 0.3:
-        return known, known
-    wrong = float(rng.uniform(0, 1))
-    shift, tilt, camera = wrong * rng.standard_normal((3, 3)) * [[0.0015], [0.6], [0.0015]]
-    true = replace(
-        known,
-        screen_shift=_vec3(shift + known.screen_shift),
-        screen_tilt=_vec3(tilt + known.screen_tilt),
-        camera_shift=_vec3(camera),
-    )
-    return known, true
-
-
-def _vec3(v: Array) -> tuple[float, float, float]:
-    return float(v[0]), float(v[1]), float(v[2])
-
-
-# --- captures -------------------------------------------------------------------------------------
 
 
 def make_group(rng: np.random.Generator, options: Options) -> list[Sample]:
     """``per_room`` captures in one room with one rig. Fewer if some come out degenerate."""
     known, true = draw_rigs(rng)
-    pattern = draw_pattern(rng, light_pattern_cached(options.pattern))
+    pattern = draw_pattern(rng, light_pattern(options.pattern))
     shown = display(rng, pattern)
     # Irradiance of the room relative to the screen's, from a dark room to a bright one.
     ratio = np.exp(rng.uniform(np.log(0.05), np.log(6.0)))
@@ -275,11 +116,6 @@ def _for_correction(
 @lru_cache(maxsize=1)
 def network_cached(path: str) -> torch.nn.Module:
     return load_weights(Path(path))[0]
-
-
-@lru_cache(maxsize=2)
-def light_pattern_cached(path: str) -> Array:
-    return light_pattern(path)
 
 
 def _pack(sample: Sample, unit: float, maps: Maps) -> Sample:
@@ -344,6 +180,8 @@ def check_options(options: Options) -> None:
     if not 0 <= options.procedural <= 1:
         raise InputError("--procedural is a share between 0 and 1")
     light_pattern(options.pattern)
+    if options.network:
+        network_cached(options.network)
     if options.materials:
         find_materials(Path(options.materials))
     if options.envs:

@@ -14,7 +14,7 @@ from invrender.errors import InputError  # noqa: E402
 from invrender.images import write_exr  # noqa: E402
 from invrender.maps import constant_maps, write_maps  # noqa: E402
 from invrender.pattern import block_pattern  # noqa: E402
-from nets import data, sheet, train  # noqa: E402
+from nets import data, draw, sheet, train  # noqa: E402
 from nets.loader import batches, positions, read_batch, shards  # noqa: E402
 from nets.loss import MAPS, SPREAD, compare, total_loss, truth  # noqa: E402
 from nets.sheet import problems  # noqa: E402
@@ -150,15 +150,15 @@ def test_held_out_names_are_kept_apart(tmp_path):
     (tmp_path / "broken").mkdir()
     for n in ("basecolor", "normal", "roughness"):
         (tmp_path / "broken" / f"{n}.png").write_bytes(b"no image")
-    assert len(data._folder_materials(str(tmp_path), "train")) == 1
-    assert len(data._folder_materials(str(tmp_path), "holdout")) == 2
+    assert len(draw._folder_materials(str(tmp_path), "train")) == 1
+    assert len(draw._folder_materials(str(tmp_path), "holdout")) == 2
     (tmp_path / "rooms").mkdir()
     for n in ("venice_sunset", "other"):
         write_exr(tmp_path / "rooms" / f"{n}.exr", np.ones((8, 16, 3), np.float32))
     rooms = str(tmp_path / "rooms")
-    assert len(data._folder_environments(rooms, "train", 8)) == 1
-    assert len(data._folder_environments(rooms, "holdout", 8)) == 1
-    assert len(data.holdout_names()) == 24
+    assert len(draw._folder_environments(rooms, "train", 8)) == 1
+    assert len(draw._folder_environments(rooms, "holdout", 8)) == 1
+    assert len(draw.holdout_names()) == 24
 
 
 def test_display_and_sensor_noise_are_small_and_seeded():
