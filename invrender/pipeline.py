@@ -21,7 +21,8 @@ from invrender.images import Photo
 from invrender.maps import Maps, map_errors
 from invrender.materials import resize_maps, turn_maps
 from invrender.mirror import Ball
-from invrender.results import Report, write_results
+from invrender.report import Report
+from invrender.results import write_results
 from invrender.rig import Rig
 
 if TYPE_CHECKING:  # Dr.Jit compiles where the refinement is imported

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,29 +14,12 @@ from numpy.typing import NDArray
 from invrender.capture import Lights
 from invrender.images import write_exr, write_png
 from invrender.maps import write_maps
+from invrender.report import Report, report_html
 
 if TYPE_CHECKING:  # Dr.Jit compiles where the refinement is imported
     from invrender.refine import Refined
 
 Array = NDArray[np.floating[Any]]
-
-
-@dataclass
-class Report:
-    """What a run measured; written as ``report.json``. ``sample_size`` is in metres."""
-
-    capture: str
-    size: int
-    init: str
-    sample_size: float
-    seconds: dict[str, float]
-    photo_error: dict[str, float]
-    converged: bool
-    history: list[dict[str, float]]
-    capture_fit: dict[str, Any]
-    warnings: list[str]
-    map_error: dict[str, dict[str, float]] | None
-    versions: dict[str, str]
 
 
 def deviations(sigma: Array) -> dict[str, Array]:
@@ -67,7 +49,8 @@ def write_results(
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".") as name:
         new = Path(name)
         write_maps(new, result.maps)
-        for key, image in deviations(result.sigma).items():
+        sigma = deviations(result.sigma)
+        for key, image in sigma.items():
             write_exr(new / f"sigma_{key}.exr", image)
         for key, image in result.maps.encoded().items():
             write_png(new / f"{key}.png", image, linear=key in ("normal", "roughness"))
@@ -78,6 +61,10 @@ def write_results(
         # Grey where they agree; a tenth of white away from black or white.
         write_png(new / "difference.png", 0.5 + 5 * (picture - photo) / white, linear=True)
         (new / "report.json").write_text(json.dumps(report.__dict__, indent=2) + "\n")
+        page = report_html(
+            report, result.maps, sigma, lights.environment, lights.pattern_captured, photo, picture
+        )
+        (new / "report.html").write_text(page, encoding="utf-8")
         out.mkdir(exist_ok=True)
         for file in sorted(new.iterdir()):
             os.replace(file, out / file.name)

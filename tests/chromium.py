@@ -1,0 +1,118 @@
+"""A headless Chromium, driven over its DevTools pipe: no driver program, no socket."""
+
+import base64
+import json
+import os
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+CHROMIUM = next(
+    (p for n in ("chromium", "chromium-browser", "google-chrome") if (p := shutil.which(n))), None
+)
+FLAGS = [
+    "--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--remote-debugging-pipe",
+    "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist",
+    "--hide-scrollbars", "--disable-extensions", "--no-first-run",
+]  # fmt: skip
+
+
+class Page:
+    """One page of a browser of its own. ``problems``: console errors, exceptions, failed loads,
+    and every request that is not for the page itself or data within it."""
+
+    def __init__(self, width=1200, height=900):
+        self.profile = tempfile.TemporaryDirectory()
+        read, self.to = os.pipe()
+        self.source, write = os.pipe()
+        command = [CHROMIUM, *FLAGS, f"--window-size={width},{height}",
+                   f"--user-data-dir={self.profile.name}", "about:blank"]  # fmt: skip
+        # The pipe is file descriptors 3 and 4 of the browser.
+        script = f'exec "$@" 3<&{read} 4>&{write}'
+        self.process = subprocess.Popen(
+            ["bash", "-c", script, "bash", *command], pass_fds=(read, write),
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        os.close(read)
+        os.close(write)
+        self.count, self.session, self.buffer, self.loaded = 0, None, b"", False
+        self.problems = []
+        target = self("Target.createTarget", url="about:blank")["targetId"]
+        self.session = self("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        for domain in ("Page", "Runtime", "Log", "Network"):
+            self(f"{domain}.enable")
+
+    def __call__(self, method, **params):
+        """Send a command and wait for its result."""
+        self.count += 1
+        message = {"id": self.count, "method": method, "params": params}
+        if self.session:
+            message["sessionId"] = self.session
+        os.write(self.to, json.dumps(message).encode() + b"\0")
+        while True:
+            answer = self._receive()
+            if answer.get("id") == self.count:
+                if "error" in answer:
+                    raise RuntimeError(f"{method}: {answer['error']['message']}")
+                return answer["result"]
+
+    def _receive(self):
+        while b"\0" not in self.buffer:
+            part = os.read(self.source, 1 << 20)
+            if not part:
+                raise RuntimeError("the browser has ended")
+            self.buffer += part
+        head, _, self.buffer = self.buffer.partition(b"\0")
+        message = json.loads(head)
+        self._note(message.get("method"), message.get("params", {}))
+        return message
+
+    def _note(self, method, params):
+        if method == "Page.loadEventFired":
+            self.loaded = True
+        elif method == "Runtime.exceptionThrown":
+            self.problems.append(params["exceptionDetails"])
+        elif method == "Runtime.consoleAPICalled" and params["type"] in ("error", "warning"):
+            self.problems.append(params["args"])
+        elif method == "Log.entryAdded" and params["entry"]["level"] in ("error", "warning"):
+            self.problems.append(params["entry"])
+        elif method == "Network.requestWillBeSent":
+            url = params["request"]["url"]
+            if not url.startswith(("file:", "data:", "about:")):
+                self.problems.append(url)
+
+    def open(self, path):
+        self.loaded = False
+        self("Page.navigate", url=Path(path).resolve().as_uri())
+        while not self.loaded:
+            self._receive()
+
+    def js(self, expression):
+        """The value of a JavaScript expression, promises awaited."""
+        done = self(
+            "Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True
+        )
+        if "exceptionDetails" in done:
+            raise RuntimeError(str(done["exceptionDetails"]))
+        return done["result"].get("value")
+
+    def drag(self, start, end, button="left"):
+        """Press at one point of the window, move to another and let go."""
+        held = {"left": 1, "right": 2}[button]
+        points = [("mousePressed", start), ("mouseMoved", end), ("mouseReleased", end)]
+        for kind, (x, y) in points:
+            self("Input.dispatchMouseEvent", type=kind, x=x, y=y, button=button, buttons=held,
+                 clickCount=1)  # fmt: skip
+
+    def screenshot(self, path, whole=False):
+        """Write a PNG of the window, or of the whole page."""
+        data = self("Page.captureScreenshot", captureBeyondViewport=whole)["data"]
+        Path(path).write_bytes(base64.b64decode(data))
+
+    def close(self):
+        self.process.terminate()
+        self.process.wait()
+        os.close(self.to)
+        os.close(self.source)
+        self.profile.cleanup()
