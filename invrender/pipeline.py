@@ -134,7 +134,7 @@ def recover(
     of each, prepared in that frame.
     """
     with stage("read"):
-        reconstruct = _network() if init == "network" else None
+        networks = _networks() if init == "network" else None
     with stage("forward model"):
         # Dr.Jit compiles here; nothing before needs it.
         from invrender.initial import flat_maps
@@ -144,7 +144,7 @@ def recover(
         from invrender.refine import Shot, correct, refine
 
         shots = [Shot(s.photo, s.prepare(), s.clipped if s.clipped.any() else None) for s in seen]
-    if reconstruct is None:
+    if networks is None:
         with stage("initial maps"):
             starts = [flat_maps(s.photo, s.prepared, samples) for s in shots]
         with stage("materials"):
@@ -152,6 +152,7 @@ def recover(
         turns = [0] + [find_turn(m, starts[0]) for m in starts[1:]]
         prior = lobe_prior(own[0])
     else:
+        reconstruct, improve = networks
         with stage("initial maps"):
             estimates = [
                 reconstruct(
@@ -162,6 +163,11 @@ def recover(
                 for s in seen
             ]  # fmt: skip
         starts = [e.maps for e in estimates]
+        with stage("refine"):
+            estimates = [
+                improve(s.photo, s.prepared, e, s.clipped, samples)
+                for s, e in zip(shots, estimates, strict=True)
+            ]
         turns = [0] + [find_turn(m, starts[0]) for m in starts[1:]]
         priors = [
             network_prior(turn_maps(e.maps, -k), {n: np.rot90(x, -k) for n, x in e.sigma.items()})
@@ -173,7 +179,7 @@ def recover(
             shot if k == 0 else _turned(s, k) for shot, s, k in zip(shots, seen, turns, strict=True)
         ]
     with stage("refine"):
-        if reconstruct is None:
+        if networks is None:
             result = refine(
                 shots, prior, samples=samples,
                 progress=lambda i, e: stage.progress(f"refine: step {i}, photo error {e:.4f}"),
@@ -262,15 +268,18 @@ def _capture_fit(seen: Seen) -> dict[str, Any]:
     return fit
 
 
-def _network() -> Any:
-    """The network that comes with the package. Raises `InputError` where torch is missing."""
+def _networks() -> tuple[Any, Any]:
+    """The networks that come with the package: photo to maps, and their correction.
+
+    Raises `InputError` where torch is missing.
+    """
     try:
-        from nets.infer import Reconstructor
+        from nets.infer import Corrector, Reconstructor
     except ModuleNotFoundError as e:
         raise InputError(
             f"the network needs {e.name}: pip install 'invrender[nets]', or start flat: --init flat"
         ) from None
-    return Reconstructor()
+    return Reconstructor(), Corrector()
 
 
 def crop_mask(photo: Photo, rig: Rig, size: int) -> NDArray[np.bool_]:

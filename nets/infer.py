@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -93,9 +94,17 @@ class Corrector:
         samples: int = 64,
     ) -> Estimate:
         """One step from an estimate towards what explains the photo (H, W, 3); ``clipped``: where
-        it is saturated."""
-        batch = linearised(photo, prepared, estimate, clipped, samples)
-        out = predict(self.network, {k: torch.from_numpy(v)[None] for k, v in batch.items()})
+        it is saturated. The forward model is evaluated for a band of rows at a time."""
+
+        @lru_cache(maxsize=1)
+        def band(top: int, stop: int) -> Batch:
+            inputs = linearised(photo, prepared, estimate, clipped, samples, slice(top, stop))
+            return {k: torch.from_numpy(v)[None] for k, v in inputs.items()}
+
+        def cut(rows: slice, columns: slice) -> Batch:
+            return {k: v[..., columns] for k, v in band(rows.start, rows.stop).items()}
+
+        out = predict_tiles(self.network, photo.shape[:2], cut)
         return estimate_of(out, estimate.unit)
 
 
@@ -105,54 +114,70 @@ def linearised(
     estimate: Estimate,
     clipped: NDArray[np.bool_] | None,
     samples: int,
+    rows: slice = slice(None),
 ) -> dict[str, Array]:
-    """The correction's inputs (`nets.correction`) as float32 arrays without a batch axis."""
-    from invrender.refine import linearise, to_theta
+    """The correction's inputs (`nets.correction`) for some rows, float32, without a batch axis."""
+    from invrender.prior import to_theta
+    from invrender.refine import linearise
 
-    theta = to_theta(estimate.maps)
-    image, jacobian = linearise(prepared, theta, samples)
+    height, width = photo.shape[:2]
+    theta = to_theta(estimate.maps)[rows]
+    top = rows.indices(height)[0]
+    image, jacobian = linearise(prepared, theta, samples, top=top, height=height)
     diagonal = [jacobian[..., range(3), range(k, k + 3)] for k in (0, 3)]
     columns = [jacobian[..., k] for k in (6, 7, 8)]
     unit = max(estimate.unit, 1e-20)
-    seen = np.zeros(theta.shape[:2], bool) if clipped is None else clipped
+    seen = np.zeros((height, width), bool) if clipped is None else clipped
     images = {
-        "photo": photo / unit,
+        "photo": photo[rows] / unit,
         "image": image / unit,
         "jacobian": np.concatenate([*diagonal, *columns], -1) / unit,
         "theta": theta,
-        "sigma0": np.stack([estimate.sigma[k] for k in MAPS], -1),
-        "clipped": seen[..., None],
+        "sigma0": np.stack([estimate.sigma[k][rows] for k in MAPS], -1),
+        "clipped": seen[rows, :, None],
     }
     out = {k: np.ascontiguousarray(np.moveaxis(v, -1, 0), np.float32) for k, v in images.items()}
-    return {**out, "position": positions(*theta.shape[:2]).numpy()}
+    return {**out, "position": np.ascontiguousarray(positions(height, width).numpy()[:, rows])}
 
 
-@torch.inference_mode()
 def predict(
     network: torch.nn.Module, batch: Batch, progress: Callable[[float], None] | None = None
 ) -> Batch:
     """A network on a batch of any size, in overlapping tiles where it is large."""
-    height, width = batch["photo"].shape[-2:]
+
+    def cut(rows: slice, columns: slice) -> Batch:
+        return {
+            k: v[..., rows, columns] if k in (*PIXELS, "position") else v for k, v in batch.items()
+        }
+
+    return predict_tiles(network, batch["photo"].shape[-2:], cut, progress)
+
+
+@torch.inference_mode()
+def predict_tiles(
+    network: torch.nn.Module,
+    shape: Sequence[int],
+    cut: Callable[[slice, slice], Batch],
+    progress: Callable[[float], None] | None = None,
+) -> Batch:
+    """A network's output (B, C, H, W), tile by tile; ``cut`` gives the batch of some rows and
+    columns. Tiles come in bands of rows."""
+    height, width = shape
     tiles = list(_tiles(height, width))
-    if len(tiles) == 1:
-        out = network(batch)
-        if progress:
-            progress(1.0)
-        return out
     sums: dict[str, Tensor] = {}
     total = torch.zeros(1, 1, height, width)
     for i, (rows, columns) in enumerate(tiles):
-        cut = {
-            k: v[..., rows, columns] if k in (*PIXELS, "position") else v for k, v in batch.items()
-        }
+        out = network(cut(rows, columns))
+        if progress:
+            progress((i + 1) / len(tiles))
+        if len(tiles) == 1:
+            return out
         weight = _ramp(rows, height)[:, None] * _ramp(columns, width)
-        for k, v in network(cut).items():
+        for k, v in out.items():
             if k not in sums:
                 sums[k] = torch.zeros(*v.shape[:2], height, width)
             sums[k][..., rows, columns] += v * weight
         total[..., rows, columns] += weight
-        if progress:
-            progress((i + 1) / len(tiles))
     return {k: v / total for k, v in sums.items()}
 
 

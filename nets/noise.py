@@ -37,9 +37,11 @@ def display(rng: np.random.Generator, pattern: Array) -> Array:
 
 
 def fit_gain(shown: Array, pattern: Array, rng: np.random.Generator) -> Array:
-    """The RGB gain that a user's software finds for what the screen shows, a little off."""
+    """The RGB gain that a user's software finds for what the screen shows: a little off, and more
+    so at times, as from a small JPEG."""
     gain = (shown * pattern).sum((0, 1)) / np.maximum((pattern**2).sum((0, 1)), 1e-9)
-    return gain * np.exp(0.01 * rng.standard_normal(3))
+    error = 0.01 if rng.random() < 0.65 else 0.06
+    return gain * np.exp(error * (rng.standard_normal(3) + rng.standard_normal()))
 
 
 def capture_pattern(rng: np.random.Generator, shown: Array) -> Array:
@@ -63,7 +65,8 @@ def captured_environment(rng: np.random.Generator, env: Array, white: float) -> 
     seen = resample_environment(env, height)
     if rng.random() < 0.3:  # lamps brighter than the photo's white
         seen = np.minimum(seen, white * np.exp(rng.uniform(np.log(2), np.log(50))))
-    seen = seen * np.exp(0.02 * rng.standard_normal(3)) * np.exp(0.03 * rng.standard_normal())
+    error = 0.03 if rng.random() < 0.65 else 0.15
+    seen = seen * np.exp(0.02 * rng.standard_normal(3)) * np.exp(error * rng.standard_normal())
     return resample_environment(seen.astype(np.float32), 64)
 
 

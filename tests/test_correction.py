@@ -129,3 +129,18 @@ def test_weights_come_back(tmp_path):
     assert type(again) is type(network)
     for k, v in network.state_dict().items():
         torch.testing.assert_close(again.state_dict()[k], v)
+
+
+def test_tiles_are_linearised_where_they_lie(lit, monkeypatch):
+    """A correction in small tiles sees the same inputs as in one."""
+    prepared, photo = lit
+    whole = linearised(photo, prepared, guess(), None, 64)
+    part = linearised(photo, prepared, guess(), None, 64, slice(4, 9))
+    for k, v in whole.items():
+        np.testing.assert_allclose(part[k], v[:, 4:9], rtol=1e-3, atol=1e-5, err_msg=k)
+    monkeypatch.setattr("nets.infer.TILE", 8)
+    monkeypatch.setattr("nets.infer.OVERLAP", 2)
+    corrector = Corrector.__new__(Corrector)
+    corrector.network = build("correction").eval()
+    after = corrector(photo, prepared, guess())
+    np.testing.assert_allclose(after.maps.diffuse, guess().maps.diffuse, atol=1e-5)

@@ -13,7 +13,7 @@ from invrender.rig import Rig  # noqa: E402
 from invrender.scene import make_scene  # noqa: E402
 from nets import clues, slopes, splitsum  # noqa: E402
 from nets.blocks import NAFBlock, pad_to  # noqa: E402
-from nets.infer import Reconstructor, _tiles  # noqa: E402
+from nets.infer import Reconstructor, _tiles, predict  # noqa: E402
 from nets.loader import positions  # noqa: E402
 from nets.model import CLUES, normalise  # noqa: E402
 from nets.store import build, load_weights, save_weights  # noqa: E402
@@ -372,7 +372,7 @@ def test_tiles_cover_and_blend(reconstructor, lights, monkeypatch):
     for rows, columns in _tiles(100, 150):
         covered[rows, columns] += 1
     assert covered.min() >= 1
-    out = reconstructor.predict(make_batch(lights, 100, 150))
+    out = predict(reconstructor.network, make_batch(lights, 100, 150))
     assert out["diffuse"].shape == (1, 3, 100, 150)
     assert all(torch.isfinite(v).all() for v in out.values())
 

@@ -1,0 +1,110 @@
+"""Ablations of the network at equal steps: validation error against training time.
+
+    python benchmarks/networks.py --out DIR [--quick] [--data DIR --valid NAME=DIR ...]
+
+Every variant sees the same captures in the same order, from the same seed. ``--data`` and
+``--valid`` are folders of `nets.data` (see docs/networks.md); without them, and with --quick, a few
+procedural captures are made first. Training goes on where an earlier run stopped.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from pathlib import Path
+from typing import Any
+
+from common import bar, markdown, write_results
+from matplotlib import pyplot as plt
+
+from nets.data import Options, write_shard
+from nets.model import MAPS
+from nets.train import baseline, parser, train
+
+VARIANTS = {
+    "no clues (LPL+)": ("none", "off", "off", "off"),
+    "mirror ball": ("mirrorball", "off", "off", "off"),
+    "plane clues": ("plane", "off", "off", "off"),
+    "coloured normal clues": ("colored", "off", "off", "off"),
+    "the paper's clues": ("full", "off", "off", "off"),
+    "+ clues of the screen": ("full", "on", "off", "off"),
+    "+ slopes (ours)": ("full", "on", "on", "off"),
+    "ours with denoiser": ("full", "on", "on", "on"),
+}  # clues, active, slopes, denoiser
+FULL, NONE = "+ slopes (ours)", "no clues (LPL+)"
+
+
+def make_data(out: Path) -> None:
+    """A few small procedural captures, for --quick."""
+    for split in ("train", "holdout"):
+        folder = out / split
+        folder.mkdir(parents=True, exist_ok=True)
+        write_shard(folder, 0, Options(size=32, samples=8, split=split), 16)
+
+
+def train_variant(name: str, args: argparse.Namespace) -> list[dict[str, float]]:
+    """Train a variant and return its log."""
+    out = args.out / "runs" / name.replace(" ", "-").strip("+-").replace("(", "").replace(")", "")
+    clues, active, slopes, denoiser = VARIANTS[name]
+    options = parser().parse_args([
+        "--data", str(args.data), "--out", str(out), "--valid", *args.valid,
+        "--preset", args.preset, "--clues", clues, "--active", active, "--slopes", slopes,
+        "--denoiser", denoiser, "--steps", str(args.steps), "--every", str(args.every),
+        "--crop", str(args.crop), "--batch", str(args.batch), "--valid-count", "96",
+        "--threads", str(args.threads),
+    ])  # fmt: skip
+    train(options)
+    with open(out / "log.csv", newline="") as f:
+        return [{k: float(v) for k, v in row.items()} for row in csv.DictReader(f)]
+
+
+def main() -> None:
+    p = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    p.add_argument("--out", type=Path, required=True)
+    p.add_argument("--quick", action="store_true", help="a few steps on a few captures")
+    p.add_argument("--data", type=Path)
+    p.add_argument("--valid", nargs="*", default=[], metavar="NAME=DIR")
+    p.add_argument("--preset", default="tiny")
+    p.add_argument("--steps", type=int, default=3000)
+    p.add_argument("--threads", type=int, default=1)
+    args = p.parse_args()
+    args.every, args.crop, args.batch = max(args.steps // 10, 1), 64, 8
+    args.out.mkdir(parents=True, exist_ok=True)
+    if args.quick or args.data is None:
+        make_data(args.out)
+        args.data, args.valid = args.out / "train", [f"made={args.out / 'holdout'}"]
+        args.steps, args.every, args.crop = 4, 2, 32
+
+    logs = {name: train_variant(name, args) for name in VARIANTS}
+    sets = dict(v.split("=", 1) for v in args.valid)
+    rows: list[list[Any]] = []
+    bars = []
+    for valid, folder in sets.items():
+        constant = baseline(Path(folder), 96)
+        rows.append([valid, "a constant guess", "", *(constant[k] for k in (*MAPS, "average"))])
+        for name, log in logs.items():
+            last = log[-1]
+            errors = [last[f"{valid}_{k}"] for k in (*MAPS, "average")]
+            rows.append([valid, name, round(last["seconds"]), *errors])
+        ratio = logs[FULL][-1][f"{valid}_average"] / logs[NONE][-1][f"{valid}_average"]
+        name = f"average map RMSE, ours over no clues, {valid}"
+        bars.append(bar(name, ratio, 0.84, at_least=False))
+    header = ["set", "variant", "seconds", *MAPS, "average"]
+    (args.out / "networks.md").write_text(markdown(header, rows))
+
+    figure, axes = plt.subplots(1, len(sets), figsize=(6 * len(sets), 4), squeeze=False)
+    for axis, valid in zip(axes[0], sets, strict=True):
+        for name, log in logs.items():
+            x = [row["seconds"] for row in log]
+            axis.plot(x, [row[f"{valid}_average"] for row in log], ".-", label=name)
+        axis.set(xscale="log", yscale="log", xlabel="seconds of training", ylabel="average RMSE")
+        axis.set_title(valid)
+    axes[0][0].legend(fontsize=7)
+    figure.tight_layout()
+    figure.savefig(args.out / "networks.png", dpi=120)
+    result = {"rows": rows, "steps": args.steps, "preset": args.preset, "bars": bars}
+    write_results(args.out, result)
+
+
+if __name__ == "__main__":
+    main()
