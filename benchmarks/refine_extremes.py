@@ -1,0 +1,144 @@
+"""Stiff and extreme samples: how far the flat chain comes, and what it says of it.
+
+    python benchmarks/refine_extremes.py [--quick] --out DIR
+
+Photos are rendered by the forward model from known maps and refined without a network, with the
+true lights unless the case says otherwise. A case ends well if the photo is explained to within
+`invrender.pipeline.POOR_FIT`; where it is not, a run warns.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from common import markdown, write_results
+
+from invrender.environments import procedural_environment, scale_environment
+from invrender.initial import flat_maps
+from invrender.lobes import fit_lobes
+from invrender.maps import Maps, constant_maps, map_errors
+from invrender.pattern import default_pattern
+from invrender.pipeline import POOR_FIT
+from invrender.prior import lobe_prior
+from invrender.refine import Shot, refine
+from invrender.render import make_scene, picture, prepare
+from invrender.rig import Rig
+
+RIG, GAIN = Rig(), 2.0
+
+
+@dataclass
+class Case:
+    """noise: relative to a pixel; clip: share of the pixels that saturate."""
+
+    maps: Maps
+    environment: Any
+    noise: float = 0.005
+    clip: float = 0.0
+    rig: Rig = field(default_factory=Rig)
+
+
+def cases(n: int) -> dict[str, Case]:
+    """The cases at n × n pixels."""
+    room = scale_environment(procedural_environment(3, 64), 0.3)
+
+    def one(k_d: Any, k_s: Any, rho: float) -> Maps:
+        maps = constant_maps(n, n, k_d, k_s, rho)
+        y, x = np.mgrid[:n, :n] / n * 2 * np.pi
+        maps.diffuse *= (1 + 0.2 * np.sin(3 * x) * np.sin(4 * y)).astype(np.float32)[..., None]
+        return maps
+
+    mixed = one((0.4, 0.3, 0.2), 0.04, 0.8)
+    mixed.diffuse[:, : n // 2], mixed.specular[:, : n // 2] = 0, 0.9
+    mixed.roughness[:, : n // 2] = 0.06
+    lamp = room.copy()
+    lamp[10:13, 20:24] += 300
+    sun = room.copy()
+    sun[12, 70] += 2e4
+    matt = one((0.5, 0.35, 0.2), 0.04, 0.5)
+    return {
+        "near-mirror beside rough": Case(mixed, room),
+        "black velvet": Case(one(0.01, 0.02, 0.9), room),
+        "white paper": Case(one(0.8, 0.04, 0.7), room),
+        "polished metal under a lamp": Case(one(0, (0.9, 0.8, 0.6), 0.12), lamp),
+        "one-texel sun": Case(matt, sun),
+        "dark room, noise 20%": Case(matt, None, noise=0.2),
+        "half of the photo clipped": Case(matt, room, clip=0.5),
+        "screen and camera 20% too high": Case(
+            matt, room, rig=replace(RIG, screen_height=1.2 * RIG.screen_height)
+        ),
+        "near-mirror, 20% too high": Case(
+            mixed, room, rig=replace(RIG, screen_height=1.2 * RIG.screen_height)
+        ),
+    }
+
+
+def run(case: Case, seed: int) -> dict[str, Any]:
+    """Photograph a case and refine it."""
+    rng = np.random.default_rng(seed)
+    pattern = default_pattern()
+    true = prepare(make_scene(case.rig, pattern, case.environment, GAIN))
+    photo = picture(true, case.maps, 256)
+    photo = np.maximum(photo * (1 + case.noise * rng.standard_normal(photo.shape)), 0)
+    photo = photo.astype(np.float32)
+    clipped = None
+    if case.clip:
+        white = np.quantile(photo.max(-1), 1 - case.clip)
+        clipped = photo.max(-1) >= white
+        photo = np.minimum(photo, np.float32(white))
+
+    began = time.perf_counter()
+    prepared = prepare(make_scene(RIG, pattern, case.environment, GAIN))
+    start = flat_maps(photo, prepared)
+    lobes = fit_lobes(photo, prepared)
+    result = refine([Shot(photo, prepared, clipped)], lobe_prior(lobes))
+    seconds = time.perf_counter() - began
+    images = [*result.maps.encoded().values(), result.sigma]
+    before, after = map_errors(start, case.maps), map_errors(result.maps, case.maps)
+    kept = None
+    if clipped is not None:
+        same = np.abs(result.maps.diffuse - lobes.diffuse)[clipped].max()
+        kept = float(same)
+    return {
+        "initial": before,
+        "refined": after,
+        "photo_error": result.history[-1]["photo_error"],
+        "iterations": len(result.history) - 1,
+        "converged": result.converged,
+        "warns": not result.converged or result.history[-1]["photo_error"] > POOR_FIT,
+        "finite": bool(all(np.isfinite(i).all() for i in images)),
+        "greatest albedo": float((result.maps.diffuse + result.maps.specular).max()),
+        "moved where clipped": kept,
+        "seconds": seconds,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--quick", action="store_true", help="16 × 16 pixels")
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+    results: dict[str, Any] = {}
+    rows = []
+    for seed, (name, case) in enumerate(cases(16 if args.quick else 64).items()):
+        r = results[name] = run(case, seed)
+        maps = [f"{r['initial'][n]:.3f} → {r['refined'][n]:.3f}" for n in r["initial"]]
+        end = "yes" if r["converged"] else "no"
+        end += ", warns" if r["warns"] else ""
+        row = [name, *maps, r["photo_error"], r["iterations"], end, r["seconds"]]
+        rows.append(row)
+        print(*row, "" if r["finite"] else "NOT FINITE", flush=True)
+    names = [*next(iter(results.values()))["initial"]]
+    header = ["case", *names, "photo error", "steps", "converged", "seconds"]
+    (args.out / "refine_extremes.md").write_text(markdown(header, rows))
+    write_results(args.out, {"cases": results})
+
+
+if __name__ == "__main__":
+    main()
