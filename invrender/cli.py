@@ -13,15 +13,18 @@ import logging
 import math
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import shtab
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.logging import RichHandler
+from rich.markup import escape
 
-from invrender import compare_cli, export_cli, pattern_cli
+from invrender import compare_cli, doctor, export_cli, pattern_cli
 from invrender.errors import InputError
 
 EXAMPLE = Path(__file__).parent / "data" / "example"
@@ -60,8 +63,9 @@ def _parser() -> argparse.ArgumentParser:
     refine.add_argument(
         "capture",
         type=Path,
+        nargs="+",
         help="a folder with photo.*, rig.toml and the pattern; 'example' is the one that comes "
-        "with invrender",
+        "with invrender. The results of several go to OUT/NAME; those that are there are skipped",
     )
     refine.add_argument("-o", "--out", type=Path, required=True, help="folder for the results")
     refine.add_argument("--size", type=int, default=256, help="pixels a side of the maps (256)")
@@ -93,6 +97,10 @@ def _parser() -> argparse.ArgumentParser:
         help="the screen's radiance for white, one number or three, instead of the ball's; with "
         "--environment the photo needs no ball",
     )
+    refine.add_argument("--workers", type=int, default=1, help="processes for several captures (1)")
+    refine.add_argument(
+        "--scheduler", metavar="ADDRESS", help="Dask scheduler for several captures (extra cluster)"
+    )
     refine.add_argument("--json", action="store_true", help="print the report as JSON")
     refine.set_defaults(run=_refine)
 
@@ -119,6 +127,17 @@ def _parser() -> argparse.ArgumentParser:
     pattern_cli.add_parser(commands)
     compare_cli.add_parser(commands)
     export_cli.add_parser(commands)
+    doctor.add_parser(commands)
+    completion = commands.add_parser(
+        "completion",
+        help="print a shell's completion script",
+        description="Print a completion script; for bash: "
+        'eval "$(invrender completion bash)" in ~/.bashrc',
+    )
+    completion.add_argument("shell", choices=shtab.SUPPORTED_SHELLS)
+    completion.set_defaults(
+        run=lambda args, console: print(shtab.complete(parser, args.shell)) or 0
+    )
     for command in commands.choices.values():
         loudness = command.add_mutually_exclusive_group()
         loudness.add_argument("-q", "--quiet", action="store_true", help="print only errors")
@@ -154,19 +173,16 @@ def _gain(text: str) -> tuple[float, ...]:
 def _refine(args: argparse.Namespace, console: Console) -> int:
     from invrender.pipeline import refine_capture
 
-    folder = EXAMPLE if str(args.capture) == "example" else args.capture
+    folders = [EXAMPLE if str(c) == "example" else c for c in args.capture]
+    options = {
+        "size": args.size, "init": args.init, "samples": args.samples, "ball": args.ball,
+        "environment": _room(args.environment), "gain": args.gain,
+    }  # fmt: skip
+    if len(folders) > 1:
+        return _refine_several(args, folders, options, console)
     with console.status("") as status:
-        report = refine_capture(
-            folder,
-            args.out,
-            size=args.size,
-            init=args.init,
-            samples=args.samples,
-            ball=args.ball,
-            environment=_room(args.environment),
-            gain=args.gain,
-            progress=lambda stage: status.update(f"{stage} …"),
-        )
+        progress = lambda stage: status.update(f"{stage} …")  # noqa: E731
+        report = refine_capture(folders[0], args.out, progress=progress, **options)
     if args.json:
         print(json.dumps(report.__dict__))
         return 0
@@ -187,6 +203,46 @@ def _refine(args: argparse.Namespace, console: Console) -> int:
     for warning in report.warnings:
         console.print(f"  warning: {warning}", markup=False, highlight=False)
     return 0
+
+
+def _refine_several(
+    args: argparse.Namespace, folders: list[Path], options: dict[str, Any], console: Console
+) -> int:
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.table import Table
+
+    from invrender.batch import refine_captures
+
+    last = TextColumn("{task.fields[last]}", markup=False)
+    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), last)
+    outcomes = []
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task("", total=len(folders), last="")
+        for outcome in refine_captures(
+            folders, args.out, scheduler=args.scheduler, workers=args.workers, **options
+        ):
+            outcomes.append(outcome)
+            bar.update(task, advance=1, last=f"{outcome.name} {outcome.status}")
+    outcomes.sort(key=lambda o: o.name)
+    table = Table("capture", "", "seconds", "photo error", "map error")
+    for o in outcomes:
+        cells = ["", "", ""]
+        if o.report is not None:
+            before, after = (o.report.photo_error[k] for k in ("initial", "refined"))
+            error = o.report.map_error
+            cells = [
+                f"{sum(o.report.seconds.values()):.1f}", f"{before:.4f} → {after:.4f}",
+                f"{error['refined']['average']:.4f}" if error else "",
+            ]  # fmt: skip
+        table.add_row(escape(o.name), o.status, *cells)
+    if args.json:
+        print(json.dumps([asdict(o) for o in outcomes]))
+    else:
+        console.print(table)
+    for o in outcomes:
+        if o.error:
+            Console(stderr=True).print(f"{o.name}: {o.error}", markup=False, highlight=False)
+    return 1 if any(o.status == "failed" for o in outcomes) else 0
 
 
 def _room(name: str | None) -> NDArray[np.floating[Any]] | None:

@@ -66,5 +66,6 @@ def write_results(
         )
         (new / "report.html").write_text(page, encoding="utf-8")
         out.mkdir(exist_ok=True)
-        for file in sorted(new.iterdir()):
+        # The report last: where it is, the rest is.
+        for file in sorted(new.iterdir(), key=lambda f: f.name == "report.json"):
             os.replace(file, out / file.name)
