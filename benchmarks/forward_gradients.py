@@ -16,14 +16,11 @@ from invrender.photograph import mi
 from invrender.scene import make_view
 
 
-def prb_gradients(case: Case, adjoint: Array) -> Callable[[int, int], list[Array]]:
-    """Mitsuba's path replay backpropagation of the same adjoint image, one sensor pixel a texel."""
-    n, size = case.n, RIG.screen_size
-    scene = case.mitsuba["path"]
-    params = mi.traverse(scene)
-    keys = {name: next(k for k, _ in params if k.endswith(f".{name}")) for name in MAPS}
+def sample_sensor(n: int) -> mi.Sensor:
+    """The camera with one pixel a texel of the sample, n × n; of the nominal rig."""
+    size = RIG.screen_size
     half = 0.625 * size
-    sensor = mi.load_dict(
+    return mi.load_dict(
         {
             "type": "perspective",
             "fov": float(np.degrees(2 * np.arctan(half / RIG.screen_height))),
@@ -47,6 +44,15 @@ def prb_gradients(case: Case, adjoint: Array) -> Callable[[int, int], list[Array
             },
         }
     )
+
+
+def prb_gradients(case: Case, adjoint: Array) -> Callable[[int, int], list[Array]]:
+    """Mitsuba's path replay backpropagation of the same adjoint image, one sensor pixel a texel."""
+    n = case.n
+    scene = case.mitsuba["path"]
+    params = mi.traverse(scene)
+    keys = {name: next(k for k, _ in params if k.endswith(f".{name}")) for name in MAPS}
+    sensor = sample_sensor(n)
     integrator = mi.load_dict({"type": "prb", "max_depth": 2})
     grad_in = mi.TensorXf(np.ascontiguousarray(adjoint, np.float32))
 
