@@ -97,6 +97,12 @@ def _parser() -> argparse.ArgumentParser:
         help="the screen's radiance for white, one number or three, instead of the ball's; with "
         "--environment the photo needs no ball",
     )
+    refine.add_argument(
+        "--joint",
+        action="store_true",
+        help="the captures show the same square of one sample (another pattern or room, the sample "
+        "turned by quarters): one result from all, in the frame of the first",
+    )
     refine.add_argument("--workers", type=int, default=1, help="processes for several captures (1)")
     refine.add_argument(
         "--scheduler", metavar="ADDRESS", help="Dask scheduler for several captures (extra cluster)"
@@ -178,11 +184,12 @@ def _refine(args: argparse.Namespace, console: Console) -> int:
         "size": args.size, "init": args.init, "samples": args.samples, "ball": args.ball,
         "environment": _room(args.environment), "gain": args.gain,
     }  # fmt: skip
-    if len(folders) > 1:
+    if len(folders) > 1 and not args.joint:
         return _refine_several(args, folders, options, console)
     with console.status("") as status:
         progress = lambda stage: status.update(f"{stage} …")  # noqa: E731
-        report = refine_capture(folders[0], args.out, progress=progress, **options)
+        first, *more = folders
+        report = refine_capture(first, args.out, more=more, progress=progress, **options)
     if args.json:
         print(json.dumps(report.__dict__))
         return 0

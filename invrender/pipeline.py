@@ -30,6 +30,7 @@ if TYPE_CHECKING:  # Dr.Jit compiles where the refinement is imported
 
 Array = NDArray[np.floating[Any]]
 FINAL_SAMPLES = 256
+FAR_OFF = 0.1  # of its size that the screen may hang off before the rig is in doubt
 POOR_FIT = 0.3  # photo error from which the maps are in doubt
 
 
@@ -248,7 +249,7 @@ def refine_capture(
         converged=result.converged,
         history=result.history,
         capture_fit=_capture_fit(first),
-        warnings=_warnings(first.clipped, after, result),
+        warnings=_warnings(first, after, result),
         map_error=errors,
         versions={n: version(n) for n in ("invrender", "drjit", "mitsuba", "numpy")},
     )
@@ -298,8 +299,14 @@ def _photo_error(picture: Array, photo: Array, clipped: NDArray[np.bool_]) -> fl
     return float(np.sqrt(np.mean(difference**2)) / max(float(photo[seen].mean()), 1e-12))
 
 
-def _warnings(clipped: NDArray[np.bool_], error: float, result: Refined) -> list[str]:
+def _warnings(seen: Seen, error: float, result: Refined) -> list[str]:
     warnings = []
+    clipped, fit = seen.clipped, seen.lights.fit
+    if fit.get("screen_shift", 0) > FAR_OFF * seen.lights.rig.screen_size:
+        warnings.append(
+            f"in the ball, the screen hangs {1000 * fit['screen_shift']:.0f} mm from where "
+            "rig.toml says: check its sizes, above all the screen's height"
+        )
     if clipped.any():
         warnings.append(
             f"{clipped.mean():.1%} of the sample is saturated in the photo; the maps keep their "

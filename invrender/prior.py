@@ -83,7 +83,7 @@ def to_theta(maps: Maps) -> Array:
     """θ (H, W, 9) of maps."""
     slopes = maps.normal[..., :2] / np.maximum(maps.normal[..., 2:], 0.1)
     parts = [maps.diffuse, maps.specular, maps.roughness[..., None], slopes]
-    return project(np.concatenate(parts, -1).astype(np.float32))
+    return _in_range(np.concatenate(parts, -1).astype(np.float32))
 
 
 def to_maps(theta: Array) -> Maps:
@@ -95,7 +95,13 @@ def to_maps(theta: Array) -> Maps:
 
 
 def project(theta: Array) -> Array:
-    """θ within its physical range, in place."""
+    """θ within its physical range, in place: what a surface mirrors it cannot scatter too."""
+    _in_range(theta)
+    theta[..., D] = np.minimum(theta[..., D], 1 - theta[..., S])
+    return theta
+
+
+def _in_range(theta: Array) -> Array:
     theta[..., :6] = np.clip(theta[..., :6], 0, 1)
     theta[..., R] = np.clip(theta[..., R], MIN_ROUGHNESS, 1)
     slope = np.linalg.norm(theta[..., N], axis=-1, keepdims=True)

@@ -1,5 +1,7 @@
 """The main job where parts of a capture are missing or known: dark room, no ball, two photos."""
 
+import json
+
 import numpy as np
 import pytest
 import synthetic_photo
@@ -91,11 +93,13 @@ def test_known_room_without_ball(tmp_path, truth):
 def test_two_captures_are_solved_jointly(tmp_path, truth):
     a = capture(tmp_path / "a", truth, ball=None)
     b = capture(tmp_path / "b", truth, ball=None, pattern=blocks(seed=6))
-    known = {"environment": np.zeros((8, 16, 3), np.float32), "gain": GAIN}
-    known |= {"size": SIZE, "init": "flat"}
-    report = refine_capture(a, tmp_path / "out", more=[b], **known)
-    assert report.capture == "a + b"
-    assert report.map_error["refined"]["average"] < 0.06
+    out = tmp_path / "out"
+    known = ["--environment", "none", "--gain", "2,2.1,1.9", "--init", "flat", "-q"]
+    command = ["refine", str(a), str(b), "--joint", "-o", str(out), "--size", str(SIZE), *known]
+    assert main(command) == 0
+    report = json.loads((out / "report.json").read_text())
+    assert report["capture"] == "a + b"
+    assert report["map_error"]["refined"]["average"] < 0.06
 
 
 @pytest.mark.parametrize("gain", ["0", "1,2", "-1,1,1", "a", "inf"])

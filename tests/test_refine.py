@@ -140,6 +140,7 @@ def test_any_photo_gives_finite_maps_in_range(prepared, value):
     result = refine([Shot(photo, prepared)], lobe_prior(maps), iterations=3)
     for image in result.maps.encoded().values():
         assert np.isfinite(image).all() and image.min() >= 0 and image.max() <= 1
+    assert (result.maps.diffuse + result.maps.specular).max() <= 1 + 1e-6
     assert result.maps.roughness.min() >= MIN_ROUGHNESS
     assert np.isfinite(result.sigma).all()
 
