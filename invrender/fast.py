@@ -48,9 +48,6 @@ def shade_fast(
 
     n_samples = dr.opaque(uint, samples)
     inv_n = 1 / scalar(n_samples)
-    if tables.lamps is not None:
-        most = dr.maximum(n_samples, LAMP_SAMPLES)
-        _add_lamps(sums, tables, screen, view, rho, normal, most)
     if tables.screen is not None or tables.sky is not None:
 
         def specular(i: Any) -> list[list[Any]]:
@@ -63,6 +60,9 @@ def shade_fast(
             )
 
         sums.run(n_samples, specular, (1, 2), "specular", inv_n)
+    if tables.lamps is not None:
+        most = dr.maximum(n_samples, LAMP_SAMPLES)
+        _add_lamps(sums, tables, screen, view, rho, normal, most)
     shading = sums.shading()
     # The sky behind the screen is subtracted: where that is nearly all of it, rounding may show.
     shading.irradiance = dr.maximum(shading.irradiance, 0)
