@@ -102,8 +102,8 @@ def test_materialx_is_valid_and_lossless(maps, tmp_path):
 @pytest.mark.parametrize(("convention", "sign"), [("opengl", 1), ("directx", -1)])
 def test_unreal_packing(maps, tmp_path, convention, sign):
     done = export_maps(
-        maps, tmp_path / "u", "unreal", name="rust", normal_convention=convention
-    )  # fmt: skip
+        maps, tmp_path / "u", "unreal", name="rust", format="png8", normal_convention=convention
+    )
     read = {k: png(tmp_path / "u" / f"T_rust_{k}.png", k == "BC") for k in ("BC", "ORM", "S", "N")}
     m, f0 = read["ORM"][..., 2:], 0.08 * read["S"][..., None]
     back = Maps(
@@ -117,7 +117,7 @@ def test_unreal_packing(maps, tmp_path, convention, sign):
 
 
 def test_unity_specular_workflow(maps, tmp_path):
-    export_maps(maps, tmp_path / "u", "unity", name="rust")
+    export_maps(maps, tmp_path / "u", "unity", name="rust", format="png8")
     packed = png(tmp_path / "u" / "rust_SpecularSmoothness.png", True)
     albedo = png(tmp_path / "u" / "rust_Albedo.png", True)
     specular = packed[..., :3]
@@ -138,6 +138,26 @@ def test_blender_names_and_16_bits(maps, tmp_path):
     assert np.abs(rough - maps.roughness).max() < 1e-5
     normal = read_image(tmp_path / "b" / "rust_Normal.png", linear=True)
     assert np.abs(decode(normal) - maps.normal).max() < 1e-4
+
+
+@pytest.mark.parametrize("target", ["blender", "unreal", "unity"])
+def test_polished_metal_survives_by_default(tmp_path, target):
+    """Sixteen bits: a normal's eighth bit moves a narrow highlight by more than its width."""
+    y, x = np.mgrid[:SIZE, :SIZE] / SIZE
+    normal = np.dstack([0.05 * np.sin(9 * x + 3 * y), 0.05 * np.cos(7 * y), np.ones_like(x)])
+    normal = (normal / np.linalg.norm(normal, axis=-1, keepdims=True)).astype(np.float32)
+    rgb = np.ones((SIZE, SIZE, 3), np.float32)
+    polished = Maps(0 * rgb, 0.9 * rgb, np.full((SIZE, SIZE), 0.0612, np.float32), normal)
+    (default,) = export_maps(polished, tmp_path / "a", target).errors.values()
+    (bytes_only,) = export_maps(polished, tmp_path / "b", target, format="png8").errors.values()
+    assert default["rerender"] < 0.002 < 0.03 < bytes_only["rerender"]
+
+
+def test_width_is_the_reports(maps, tmp_path):
+    write_maps(tmp_path, maps)
+    report = {"capture": "x", "sample_size": 0.25}
+    (tmp_path / "report.json").write_text(json.dumps(report))
+    assert export(tmp_path, tmp_path / "m.glb", "gltf").width == 0.25
 
 
 def test_mitsuba_scene_renders_alike(maps, tmp_path):

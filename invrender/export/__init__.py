@@ -53,8 +53,8 @@ TARGETS = {
     "gltf": Target(write_gltf, ("png8", "jpeg"), ("opengl",), height=False, file=True),
     "materialx": Target(write_materialx, ("exr", "png16", "png8", "jpeg"), ("opengl",)),
     "blender": Target(write_blender, ("png16", "png8", "exr", "jpeg")),
-    "unreal": Target(write_unreal, ("png8", "png16", "exr", "jpeg"), ("directx", "opengl")),
-    "unity": Target(write_unity, ("png8", "png16", "exr")),
+    "unreal": Target(write_unreal, ("png16", "png8", "exr", "jpeg"), ("directx", "opengl")),
+    "unity": Target(write_unity, ("png16", "png8", "exr")),
     "mitsuba": Target(write_mitsuba, ("exr",), ("opengl",), height=False),
 }
 
