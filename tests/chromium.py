@@ -3,6 +3,7 @@
 import base64
 import json
 import os
+import select
 import shutil
 import subprocess
 import tempfile
@@ -59,6 +60,8 @@ class Page:
 
     def _receive(self):
         while b"\0" not in self.buffer:
+            if not select.select([self.source], [], [], 120)[0]:
+                raise TimeoutError("the browser does not answer")
             part = os.read(self.source, 1 << 20)
             if not part:
                 raise RuntimeError("the browser has ended")
