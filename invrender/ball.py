@@ -10,7 +10,7 @@ of the image can be predicted, and no coin or printed circle passes that test.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -40,6 +40,10 @@ MIN_CONFIDENCE = 0.5
 MIRROR_WEIGHT = 1.0
 OUTLINE_WEIGHT = 0.5  # of the outline beside the horizon: a mirror pales into the table there
 TOE = 0.1  # added to radiance over its median before the logarithm
+TILT_PRIOR = 0.5  # of the camera, degrees; a wider one lets the horizon's errors through
+OUTLINE_SHARE = 0.3  # of an outline's edge beside a horizon's
+POLISHED = (0.97, 1.0, 1.03)  # radii, over the one found, from which the last fit starts
+CORRELATED = 10.0  # residuals side by side that tell the same
 BLURS = (0.7, 1.4, 2.8, 5.6, 11.2)  # of the levels, in the view's pixels
 
 
@@ -80,8 +84,10 @@ def find_ball(photo: Photo, rig: Rig, manual: tuple[float, float, float] | None 
     found = make_ball(rig, np.array([theta[0], theta[1], 0.0]), theta[2], size)
     confidence = _confidence(view, rig, theta)
     fine = _view(photo, np.asarray(found.centre), 1.6 * found.radius, found.radius / 160)
-    theta = _polish(fine, rig, theta)
-    ball = make_ball(rig, np.array([theta[0], theta[1], 0.0]), theta[2], size, confidence)
+    fits = [_polish(fine, rig, theta * [1, 1, k]) for k in POLISHED]
+    theta, tilted = max(fits, key=lambda fit: _score(fine, fit[1], fit[0], 240)[0])
+    seen = make_ball(tilted, np.array([theta[0], theta[1], 0.0]), theta[2], size, confidence)
+    ball = replace(place_ball(rig, size, *seen.centre, seen.radius), confidence=confidence)
     (x, y), r = ball.centre, ball.radius
     if confidence < MIN_CONFIDENCE:
         raise InputError(
@@ -325,48 +331,62 @@ def _climb(view: _View, rig: Rig, start: Array, blur: int, reach: float, evaluat
     return np.asarray(start + result.x * unit)
 
 
-def _polish(view: _View, rig: Rig, theta: Array, reach: float = 0.05) -> Array:
-    """Sub-pixel (x, y, radius) by robust least squares, Gauss–Newton.
+def _polish(view: _View, rig: Rig, theta: Array, reach: float = 0.05) -> tuple[Array, Rig]:
+    """Sub-pixel (x, y, radius) by robust least squares, Gauss–Newton, and the rig they hold in.
 
-    Residuals are the distances along the horizon's normals to the strongest edge within ``reach``
-    radii, and the differences between the rim and the table it mirrors (which know the outline's
-    place even where it is no edge, in a contact shadow). Each kind is scaled by its own spread and
-    weighted as by a Cauchy distribution.
+    Residuals are the distances along the normals of horizon and outline to the strongest edge
+    within ``reach`` radii, and the differences between the rim and the table it mirrors (which know
+    the outline's place even where it is no edge, in a contact shadow). Each kind is scaled by its
+    own spread and weighted as by a Cauchy distribution. The camera's tilt is fitted as well, within
+    `TILT_PRIOR`: by a degree it moves the horizon against the outline by a hundredth of the radius.
     """
+
+    def tilted(p: Array) -> Rig:
+        return replace(rig, camera_tilt=tuple(np.add(rig.camera_tilt, [p[3], p[4], 0])))
+
     radius = float(
         np.linalg.norm(np.diff(_curves(view, rig, theta, 2)[2], axis=0)) / 2
     )  # in the view's pixels
+    unit = np.array([*np.full(3, theta[2] * 2e-3), 0.1, 0.1])
+    aim = rig.camera[2] * math.radians(1)  # a tilt moves the image: x and y follow it
+    follow = np.eye(5)
+    follow[3, 1], follow[4, 0] = aim, -aim
+    p = np.array([*theta, 0.0, 0.0])
     for turn in range(12):
         blur = max(0, 2 - turn // 2)
         near = max(2.0, reach * radius * 0.8**turn)
-
-        def residuals(t: Array) -> Array:
-            return _mirror_difference(view, rig, t, blur)[0].reshape(-1)  # noqa: B023
-
-        moves = [theta + np.eye(3)[k] * theta[2] * 2e-3 for k in range(3)]
-        curve, normal = _curves(view, rig, theta, 240)[:2]
-        edge, strength = _edges(view, curve, normal, near)
-        shifted = [_curves(view, rig, m, 240)[0] for m in moves]
-        edge_slope = np.stack([np.sum((m - curve) * normal, -1) for m in shifted], -1) * 500
-        valid = np.repeat(_mirror_difference(view, rig, theta)[1], 3)
-        base = residuals(theta)
-        mirror_slope = np.stack([residuals(m) - base for m in moves], -1) * 500
+        here = tilted(p)
+        steps = unit[:, None] * follow
+        moves = [(tilted(p + d), (p + d)[:3]) for d in steps]
+        theta = p[:3]
+        curves = _curves(view, here, theta, 240)
+        shifted = [_curves(view, r, t, 240) for r, t in moves]
+        base, valid3 = _mirror_difference(view, here, theta, blur)
+        valid = np.repeat(valid3, 3)
+        base = base.reshape(-1)
+        mirror_slope = np.stack(
+            [_mirror_difference(view, r, t, blur)[0].reshape(-1) - base for r, t in moves], -1
+        )
         offset = float(np.median(base[valid])) if valid.any() else 0.0
-        normal_matrix, right = 1e-9 * np.eye(3), np.zeros(3)
-        for r, slope, weight, floor in (
-            (-edge, edge_slope, strength, 0.1),
-            (base - offset, mirror_slope, valid * 1.0, 0.02),
-        ):
+        terms = [(base - offset, mirror_slope, valid * 1.0, 0.02)]
+        for k in (0, 2):
+            edge, strength = _edges(view, curves[k], curves[k + 1], near)
+            slope = np.stack([np.sum((m[k] - curves[k]) * curves[k + 1], -1) for m in shifted], -1)
+            terms.append((-edge, slope, strength * (1 if k == 0 else OUTLINE_SHARE), 0.1))
+        prior = (unit[3] / TILT_PRIOR) ** 2
+        matrix = np.diag([1e-9, 1e-9, 1e-9, prior, prior])
+        right = -prior * np.array([0, 0, 0, p[3], p[4]]) / unit[3]
+        for r, slope, weight, floor in terms:
             if weight.sum() < 20:
                 continue
             spread = max(floor, 1.48 * float(np.median(np.abs(r[weight > 0.1]))))
-            k = weight / (1 + (r / spread) ** 2) / spread**2
-            normal_matrix = normal_matrix + slope.T @ (slope * k[:, None])
-            right = right - slope.T @ (k * r)
-        damped = normal_matrix + np.diag(np.diag(normal_matrix)) * 1e-3
-        step = np.linalg.solve(damped, right)
-        theta = theta + np.clip(step, -0.02, 0.02) * theta[2]
-    return theta
+            k2 = weight / (1 + (r / spread) ** 2) / spread**2 / CORRELATED
+            matrix = matrix + slope.T @ (slope * k2[:, None])
+            right = right - slope.T @ (k2 * r)
+        damped = matrix + np.diag(np.diag(matrix)) * 1e-3
+        step = np.clip(np.linalg.solve(damped, right), -10, 10)
+        p = p + step @ steps
+    return p[:3], tilted(p)
 
 
 def _edges(view: _View, curve: Array, normal: Array, reach: float) -> tuple[Array, Array]:

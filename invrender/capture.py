@@ -19,16 +19,25 @@ from invrender.rig import Rig, read_rig
 from invrender.screen import fit_screen
 from invrender.unfold import (
     fill_environment,
+    pixel_grid,
     predict_pattern,
+    screen_coordinates,
     screen_lookup,
+    trace_ball,
     unfold_environment,
     unfold_pattern,
+    window,
 )
 
 Array = NDArray[np.floating[Any]]
 PHOTO_NAMES = tuple(f"photo.{e}" for e in ("exr", "tif", "tiff", "png", "jpg", "jpeg"))
 MIN_PHOTO = 64
 
+SATURATED = 0.01  # share of saturated pixels from which it is told, and the screen fitted with care
+# Residual of the ideal pattern from which the ball shows another pattern, or is none: nine
+# hard simulated balls had at most 0.12, nine wrong ones at least 0.29.
+NO_PATTERN = 0.22
+NO_CURVE = 0.2  # share of saturated pixels from which gain and gamma cannot be told apart
 POOR = 0.01  # residual of the ideal pattern from which the screen itself is in doubt
 # Shift in sizes of the sample, and tilt in degrees, that an error of the ball's place, a hundredth
 # of its radius, cannot explain: a smaller one is taken for such an error.
@@ -59,9 +68,11 @@ class Lights:
     is ``gain`` (3,) times ``pattern`` (h, w, 3); ``pattern_captured`` is what the ball shows of it,
     rectified. ``fit`` tells how well: ``residual`` of the pattern's fit relative to the gain,
     ``gamma`` the exponent on the pattern that fits best (1: as it should be; the gain is for 1),
-    ``blur`` the camera's in pixels, ``pixels`` the number used. Where the pattern as it should be
-    fits badly, ``pattern`` is as the display really shows it, and ``rig`` as the screen really
-    hangs; else both are those of the capture.
+    ``blur`` the camera's in pixels, ``pixels`` the number used, ``saturated`` and
+    ``room_saturated`` the shares of screen and room in the ball that are saturated,
+    ``pattern_residual`` the residual before the screen's pose and curve were fitted. Where the
+    pattern as it should be fits badly, ``pattern`` is as the display really shows it, and ``rig``
+    as the screen really hangs; else both are those of the capture.
     """
 
     environment: Array
@@ -219,7 +230,11 @@ def fit_gain(photo: Photo, rig: Rig, ball: Ball, pattern: Array) -> tuple[Array,
     residual, gain = solve(blur, 1.0)
     if not (gain > 0).all():
         raise InputError("the screen is dark in the ball's image: is the pattern displayed?")
-    fit = {"residual": residual, "gamma": gamma, "blur": blur, "pixels": float(use.sum())}
+    saturated = float(photo.clipped[rows, columns][whole].mean())
+    fit = {
+        "residual": residual, "gamma": gamma, "blur": blur, "pixels": float(use.sum()),
+        "saturated": saturated,
+    }  # fmt: skip
     return gain, fit
 
 
@@ -232,9 +247,18 @@ def extract_lights(capture: Capture, ball: Ball, height: int = 128) -> Lights:
         raise InputError(f"the environment needs an even height of 8 rows or more, got {height}")
     pattern = capture.pattern
     gain, fit = fit_gain(photo, rig, ball, pattern)
-    if fit["residual"] > POOR:
-        screen = fit_screen(photo, rig, ball, pattern)
-        if screen.residual < 0.5 * fit["residual"]:
+    fit["pattern_residual"] = fit["residual"]
+    if fit["residual"] > NO_PATTERN and ball.confidence < 1:
+        (x, y), r = ball.centre, ball.radius
+        raise InputError(
+            f"what looks like the mirror ball ({x:.0f}, {y:.0f}, radius {r:.0f} pixels) does not "
+            "show the pattern: check that the display shows it the right way round, or give the "
+            f"ball by hand, --ball {x:.0f},{y:.0f},{r:.0f} to keep this one"
+        )
+    if fit["residual"] > POOR or fit["saturated"] > SATURATED:
+        screen = fit_screen(photo, rig, ball, pattern, curve=fit["saturated"] < NO_CURVE)
+        # It knows that a saturated pixel had at least so much light; `fit_gain` leaves it out.
+        if screen.residual < 0.5 * fit["residual"] or fit["saturated"] > SATURATED:
             pattern, gain = screen.shown, screen.gain
             shift, tilt = (
                 np.linalg.norm(screen.rig.screen_shift),
@@ -246,7 +270,39 @@ def extract_lights(capture: Capture, ball: Ball, height: int = 128) -> Lights:
                 "residual": screen.residual, "gamma": float(np.mean(screen.gamma)),
                 "screen_shift": float(shift), "screen_tilt": float(tilt),
             }  # fmt: skip
+    fit["room_saturated"] = _room_saturated(photo, rig, ball)
     environment, coverage = unfold_environment(photo, rig, ball, height)
     environment = fill_environment(environment, coverage)
     captured = unfold_pattern(photo, rig, ball, min(256, max(pattern.shape[:2])))
     return Lights(environment, coverage, pattern, gain, captured, rig, fit)
+
+
+def _room_saturated(photo: Photo, rig: Rig, ball: Ball) -> float:
+    """Share of the ball's pixels that show the room, above the horizon, and are saturated."""
+    rows, columns = window(ball)
+    point, mirrored, seen = trace_ball(rig, ball, pixel_grid(rows, columns))
+    room = seen & (mirrored[..., 2] > 0) & ~screen_coordinates(rig, point, mirrored)[2]
+    return float(photo.clipped[rows, columns][room].mean()) if room.any() else 0.0
+
+
+def light_warnings(lights: Lights) -> list[str]:
+    """What is doubtful about the lights that a ball shows, a sentence each."""
+    warnings = []
+    fit = lights.fit
+    if fit.get("saturated", 0) > SATURATED:
+        warnings.append(
+            f"{fit['saturated']:.0%} of the screen is saturated in the ball; its radiance is "
+            "guessed from the rest, and likely too low: expose shorter"
+        )
+    if fit.get("room_saturated", 0) > 0.001:
+        warnings.append(
+            f"{fit['room_saturated']:.1%} of the room is saturated in the ball; lamps are "
+            "brighter than the photo tells, so that the room comes out too dark: expose shorter, "
+            "or take a raw photo"
+        )
+    if fit.get("pattern_residual", 0) > NO_PATTERN:
+        warnings.append(
+            f"the ball shows the pattern only to within {fit['pattern_residual']:.0%}: check "
+            "that the display shows this pattern, mirrored and the right way up"
+        )
+    return warnings

@@ -24,7 +24,7 @@ from rich.console import Console
 from rich.logging import RichHandler
 from rich.markup import escape
 
-from invrender import compare_cli, doctor, export_cli, pattern_cli
+from invrender import compare_cli, doctor, export_cli, inspect_cli, pattern_cli
 from invrender.errors import InputError
 
 EXAMPLE = Path(__file__).parent / "data" / "example"
@@ -131,6 +131,7 @@ def _parser() -> argparse.ArgumentParser:
     simulate.set_defaults(run=_simulate)
 
     pattern_cli.add_parser(commands)
+    inspect_cli.add_parser(commands, _ball)
     compare_cli.add_parser(commands)
     export_cli.add_parser(commands)
     doctor.add_parser(commands)

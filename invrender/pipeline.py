@@ -15,7 +15,14 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from invrender.ball import find_ball
-from invrender.capture import Capture, Lights, crop_sample, extract_lights, load_capture
+from invrender.capture import (
+    Capture,
+    Lights,
+    crop_sample,
+    extract_lights,
+    light_warnings,
+    load_capture,
+)
 from invrender.errors import InputError
 from invrender.images import Photo
 from invrender.maps import Maps, map_errors
@@ -300,7 +307,7 @@ def _photo_error(picture: Array, photo: Array, clipped: NDArray[np.bool_]) -> fl
 
 
 def _warnings(seen: Seen, error: float, result: Refined) -> list[str]:
-    warnings = []
+    warnings = light_warnings(seen.lights)
     clipped, fit = seen.clipped, seen.lights.fit
     if fit.get("screen_shift", 0) > FAR_OFF * seen.lights.rig.screen_size:
         warnings.append(
