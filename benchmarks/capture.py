@@ -1,0 +1,137 @@
+"""From simulated photographs to ball, lights and screen: how far off, how often, how fast.
+
+`python benchmarks/capture.py [--quick] --out DIR`. Of three photos two are HDR, one is a clipped
+JPEG; hand-held rigs, displays of other gamma, clutter, blur and noise as in `photos.py`. A quarter
+as many photos without a ball follow.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import statistics
+import time
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+from common import bar, markdown, write_results
+from photos import Shot, make_shot
+
+from invrender.ball import find_ball
+from invrender.capture import Capture, extract_lights
+from invrender.environments import irradiance
+from invrender.errors import InputError
+from invrender.mirror import make_ball
+
+SEED = 1000  # photos from here on serve for nothing else
+HEADER = ["photo", "kind", "centre", "radius", "irradiance", "gain", "shift, mm", "tilt, deg", "s"]
+
+
+def measure(shot: Shot, kind: str) -> dict[str, Any]:
+    """One photo's errors: of the ball in radii, of irradiance and gain relative, of the pose."""
+    row: dict[str, Any] = {"photo": shot.name, "kind": kind}
+    capture = Capture(shot.photo, shot.nominal, shot.pattern)
+    start = time.process_time()
+    try:
+        ball = find_ball(shot.photo, shot.nominal)
+        row["s"] = time.process_time() - start
+        row["confidence"] = ball.confidence
+        if shot.ball is not None:
+            truth = make_ball(shot.rig, shot.ball, shot.rig.ball_radius, ball.size)
+            row["centre"] = float(np.hypot(*np.subtract(ball.centre, truth.centre)) / truth.radius)
+            row["radius"] = abs(ball.radius / truth.radius - 1)
+        lights = extract_lights(capture, ball)
+    except InputError as error:
+        row["refused"] = str(error)
+        return row
+    room = shot.environment.copy()
+    room[len(room) // 2 :] = 0
+    e, t = irradiance(lights.environment), irradiance(room)
+    row["irradiance"] = float(np.abs(e - t).mean() / t.mean())
+    # Where a gamma is fitted the pattern's mean tells the light, whatever the curve.
+    light, true = (
+        (p * g).mean((0, 1)) for p, g in ((lights.pattern, lights.gain), (shot.shown, shot.gain))
+    )
+    row["gain"] = float(np.abs(light / true - 1).mean())
+    row["shift, mm"] = 1000 * float(
+        np.linalg.norm(np.subtract(lights.rig.screen_shift, shot.rig.screen_shift))
+    )
+    row["tilt, deg"] = float(
+        np.linalg.norm(np.subtract(lights.rig.screen_tilt, shot.rig.screen_tilt))
+    )
+    return row
+
+
+def big_photo() -> float:
+    """Processor seconds to find the ball in 12 megapixels."""
+    shot = make_shot(SEED - 1, width=4000)
+    start = time.process_time()
+    with contextlib.suppress(InputError):
+        find_ball(shot.photo, shot.nominal)
+    return time.process_time() - start
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--quick", action="store_true", help="within a minute")
+    parser.add_argument("--count", type=int, default=60, help="photos with a ball (60)")
+    parser.add_argument("--rooms", type=Path, help="folder of equirectangular files, for half")
+    args = parser.parse_args()
+    count = 9 if args.quick else args.count
+    rows: list[dict[str, Any]] = []
+    wrong: list[dict[str, Any]] = []
+    for i in range(count + -(-count // 4)):
+        kind = "jpeg" if i % 3 == 2 else "hdr"
+        shot = make_shot(SEED + i, kind=kind, ball=i < count, rooms=args.rooms if i % 2 else None)
+        (rows if i < count else wrong).append(measure(shot, kind))
+        last = (rows if i < count else wrong)[-1]
+        print(i, {k: round(v, 4) if isinstance(v, float) else v for k, v in last.items()})
+
+    def median(name: str, kind: str | None = None) -> float:
+        found = [r[name] for r in rows if name in r and kind in (None, r["kind"])]
+        return statistics.median(found) if found else float("inf")
+
+    good = [r.get("centre", 1) <= 0.01 and r.get("radius", 1) <= 0.01 for r in rows]
+    bars = [
+        bar("ball within 1% of its radius", float(np.mean(good)), 0.98, True),
+        bar("wrong balls accepted", sum("refused" not in r for r in wrong), 0, False),
+        bar("irradiance, HDR", median("irradiance", "hdr"), 0.03, False),
+        bar("irradiance, clipped JPEG", median("irradiance", "jpeg"), 0.15, False),
+        bar("screen's tilt, degrees", median("tilt, deg"), 0.5, False),
+        bar("screen's shift, mm", median("shift, mm"), 1.0, False),
+        bar("screen's light", median("gain"), 0.03, False),
+        bar("12 megapixels, processor seconds", big_photo(), 3.0, False),
+    ]
+    refused = sum("refused" in r for r in rows)
+    write_results(
+        args.out, {"bars": bars, "refused": refused, "photos": rows, "without a ball": wrong}
+    )
+    table = markdown(HEADER, [[r.get(k, "refused") for k in HEADER] for r in rows])
+    (args.out / "capture.md").write_text(table)
+    plot(args.out / "capture.png", rows)
+
+
+def plot(path: Path, rows: list[dict[str, Any]]) -> None:
+    """Cumulative errors of the ball and of the lights; a dashed line at each bar."""
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.5), sharey=True)
+    for axis, names in zip(axes, (("centre", "radius"), ("irradiance", "gain")), strict=True):
+        for name in names:
+            values = sorted(r[name] for r in rows if name in r)
+            axis.semilogx(values, (np.arange(len(values)) + 1) / len(rows), label=name)
+        axis.set_xlabel("relative error")
+        axis.legend()
+    axes[0].axvline(0.01, color="k", linestyle="--", linewidth=0.8)
+    axes[0].set_ylabel("share of photos")
+    figure.tight_layout()
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    main()
