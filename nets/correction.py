@@ -3,8 +3,9 @@
 Learned gradient descent (Andrychowicz et al. 2016; for materials, compare Bi et al. 2020 and
 MatFusion's guidance): a small network sees, pixel by pixel and in their neighbourhood, the photo,
 the maps so far with their expected errors, what the forward model makes of them, and the
-Gauss–Newton step that the forward model's exact Jacobian proposes. It answers how far to go, and
-the errors that remain. It is trained on what the first network leaves, on captures that it can
+Gauss–Newton step that the forward model's exact Jacobian proposes, and beside them a second
+opinion: what all pixels of a material, fitted together, say of its lobe. It answers how far to go,
+and the errors that remain. It is trained on what the first network leaves, on captures that it can
 learn from: so where the photo says nothing of a quantity, it learns to leave it alone.
 
 θ = (k_d, k_s, ρ, slopes p, q), as in `invrender.refine`. A batch is a dict of tensors:
@@ -26,7 +27,7 @@ from nets.model import MAX_SIGMA, MIN_SIGMA, Batch, Config, encode, slope_normal
 NOISE = (0.04, 0.01)  # of the photo: relative to the pixel, and to a white plane
 ALBEDO_CORRELATION = (0.9, 0.95)  # between the colours of k_d's error, and of k_s's
 REACH = (0.1, 0.1, 0.1, 0.2)  # of a step, in the outputs' unit: k_d, k_s, ρ, slopes
-INPUTS = 3 * 4 + 9 + 4 + 9 + 6 + 9 + 1 + 2
+INPUTS = 3 * 4 + 9 + 4 + 9 + 6 + 9 + 1 + 2 + 7
 
 
 def gauss_newton(batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
@@ -88,6 +89,7 @@ def features(batch: Batch) -> Tensor:
         step.clamp(-3, 3),
         torch.log1p(surprise.clamp(0, 1e4)) / 2,
         batch["position"],
+        2 * batch["lobes"] - 0.5,
     ]  # fmt: skip
     return torch.cat(parts, 1)
 

@@ -28,6 +28,7 @@ from invrender.backend import dr
 from invrender.cluster import map_tasks
 from invrender.environments import find_environments, scale_environment
 from invrender.errors import InputError
+from invrender.lobes import fit_lobes
 from invrender.maps import Maps
 from invrender.materials import find_materials
 from invrender.render import Tables, Unbiased, material_from_maps, prepare, radiance
@@ -108,7 +109,8 @@ def _for_correction(
     found = estimate_of(predict(network_cached(options.network), batch), unit)
     photo = np.moveaxis(sample["photo"].astype(np.float32), 0, -1) * unit
     clipped = (photo >= 0.999 * photo.max()).any(-1)
-    seen = linearised(photo, prepared, found, clipped, options.samples)
+    lobes = fit_lobes(photo, prepared, options.samples)
+    seen = linearised(photo, prepared, found, lobes, clipped, options.samples)
     out = {k: np.clip(v, -6e4, 6e4).astype(np.float16) for k, v in seen.items() if k != "position"}
     return {**out, "maps": sample["maps"]}
 

@@ -95,10 +95,15 @@ class Corrector:
     ) -> Estimate:
         """One step from an estimate towards what explains the photo (H, W, 3); ``clipped``: where
         it is saturated. The forward model is evaluated for a band of rows at a time."""
+        from invrender.lobes import fit_lobes
+
+        lobes = fit_lobes(photo, prepared, samples)
 
         @lru_cache(maxsize=1)
         def band(top: int, stop: int) -> Batch:
-            inputs = linearised(photo, prepared, estimate, clipped, samples, slice(top, stop))
+            inputs = linearised(
+                photo, prepared, estimate, lobes, clipped, samples, slice(top, stop)
+            )
             return {k: torch.from_numpy(v)[None] for k, v in inputs.items()}
 
         def cut(rows: slice, columns: slice) -> Batch:
@@ -112,6 +117,7 @@ def linearised(
     photo: Array,
     prepared: Tables | Unbiased,
     estimate: Estimate,
+    lobes: Maps,
     clipped: NDArray[np.bool_] | None,
     samples: int,
     rows: slice = slice(None),
@@ -135,6 +141,7 @@ def linearised(
         "theta": theta,
         "sigma0": np.stack([estimate.sigma[k][rows] for k in MAPS], -1),
         "clipped": seen[rows, :, None],
+        "lobes": to_theta(lobes)[rows, :, :7],
     }
     out = {k: np.ascontiguousarray(np.moveaxis(v, -1, 0), np.float32) for k, v in images.items()}
     return {**out, "position": np.ascontiguousarray(positions(height, width).numpy()[:, rows])}

@@ -14,7 +14,7 @@ from invrender.errors import InputError
 from nets.model import Batch
 
 GROUP = 8  # shards that are shuffled together
-PIXELS = ("photo", "ideal", "maps", "clipped", "theta", "sigma0", "image", "jacobian")
+PIXELS = ("photo", "ideal", "maps", "clipped", "theta", "sigma0", "image", "jacobian", "lobes")
 
 
 def shards(folder: Path) -> list[Path]:

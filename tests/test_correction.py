@@ -14,6 +14,7 @@ from nets.loader import positions  # noqa: E402
 from nets.store import build, load_weights, save_weights  # noqa: E402
 
 SIZE = 12
+LOBES = constant_maps(SIZE, SIZE, 0.35, 0.04, 0.45)
 torch.set_num_threads(1)
 
 
@@ -44,6 +45,7 @@ def random_batch(dtype=torch.float64):
         "sigma0": 0.02 + 0.2 * rand(4),
         "jacobian": torch.cat([rand(6), rand(9) - 0.5], 1),
         "clipped": torch.zeros(shape, dtype=dtype),
+        "lobes": rand(7),
         "position": positions(5, 4)[None].repeat(2, 1, 1, 1).to(dtype),
     }
 
@@ -91,7 +93,7 @@ def test_a_fresh_correction_changes_nothing(lit):
 def test_the_step_it_sees_points_at_the_truth(lit):
     """A sample darker than it should be: the proposed step brightens the diffuse albedo."""
     prepared, photo = lit
-    inputs = linearised(photo, prepared, guess(0.3), None, 64)
+    inputs = linearised(photo, prepared, guess(0.3), LOBES, None, 64)
     batch = {k: torch.from_numpy(v)[None] for k, v in inputs.items()}
     _, step, _ = gauss_newton(batch)
     assert (step[:, :3] > 0).float().mean() > 0.95
@@ -101,8 +103,8 @@ def test_the_step_it_sees_points_at_the_truth(lit):
 def test_unit_of_radiance_does_not_matter(lit):
     prepared, photo = lit
     brighter = prepare(make_scene(Rig(), block_pattern(64), None, gain=200.0))
-    a = linearised(photo, prepared, guess(unit=0.7), None, 64)
-    b = linearised(100 * photo, brighter, guess(unit=70.0), None, 64)
+    a = linearised(photo, prepared, guess(unit=0.7), LOBES, None, 64)
+    b = linearised(100 * photo, brighter, guess(unit=70.0), LOBES, None, 64)
     for k, v in a.items():
         np.testing.assert_allclose(b[k], v, rtol=2e-3, atol=1e-4, err_msg=k)
 
@@ -134,8 +136,8 @@ def test_weights_come_back(tmp_path):
 def test_tiles_are_linearised_where_they_lie(lit, monkeypatch):
     """A correction in small tiles sees the same inputs as in one."""
     prepared, photo = lit
-    whole = linearised(photo, prepared, guess(), None, 64)
-    part = linearised(photo, prepared, guess(), None, 64, slice(4, 9))
+    whole = linearised(photo, prepared, guess(), LOBES, None, 64)
+    part = linearised(photo, prepared, guess(), LOBES, None, 64, slice(4, 9))
     for k, v in whole.items():
         np.testing.assert_allclose(part[k], v[:, 4:9], rtol=1e-3, atol=1e-5, err_msg=k)
     monkeypatch.setattr("nets.infer.TILE", 8)
