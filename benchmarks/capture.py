@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import math
 import statistics
 import time
 from pathlib import Path
@@ -21,12 +22,14 @@ import matplotlib.pyplot as plt
 import numpy as np
 from common import bar, markdown, write_results
 from photos import Shot, make_shot
+from scipy.spatial.transform import Rotation
 
 from invrender.ball import find_ball
 from invrender.capture import Capture, extract_lights
 from invrender.environments import irradiance
 from invrender.errors import InputError
 from invrender.mirror import make_ball
+from invrender.rig import Rig
 
 SEED = 1000  # photos from here on serve for nothing else
 HEADER = ["photo", "kind", "centre", "radius", "irradiance", "gain", "shift, mm", "tilt, deg", "s"]
@@ -46,6 +49,8 @@ def measure(shot: Shot, kind: str) -> dict[str, Any]:
             row["centre"] = float(np.hypot(*np.subtract(ball.centre, truth.centre)) / truth.radius)
             row["radius"] = abs(ball.radius / truth.radius - 1)
         lights = extract_lights(capture, ball)
+        if shot.ball is None:
+            return row
     except InputError as error:
         row["refused"] = str(error)
         return row
@@ -58,13 +63,24 @@ def measure(shot: Shot, kind: str) -> dict[str, Any]:
         (p * g).mean((0, 1)) for p, g in ((lights.pattern, lights.gain), (shot.shown, shot.gain))
     )
     row["gain"] = float(np.abs(light / true - 1).mean())
-    row["shift, mm"] = 1000 * float(
-        np.linalg.norm(np.subtract(lights.rig.screen_shift, shot.rig.screen_shift))
-    )
-    row["tilt, deg"] = float(
-        np.linalg.norm(np.subtract(lights.rig.screen_tilt, shot.rig.screen_tilt))
-    )
+    found = screen_pose(lights.rig, np.asarray(ball.position))
+    assert shot.ball is not None
+    centre, turn = screen_pose(shot.rig, shot.ball)
+    row["shift, mm"] = 1000 * float(np.linalg.norm(found[0] - centre))
+    row["tilt, deg"] = math.degrees((found[1] * turn.inv()).magnitude())
     return row
+
+
+def screen_pose(rig: Rig, ball: Any) -> tuple[Any, Rotation]:
+    """Where the screen's centre is from the ball, and its rotation, both in the camera's axes.
+
+    A photo cannot tell a turned camera from a turned rig.
+    """
+    e_x, e_y = rig.screen_edges
+    centre = rig.screen_corner + e_x / 2 + e_y / 2 - ball
+    turn = Rotation.from_rotvec(rig.screen_tilt, degrees=True)
+    axes = rig.camera_axes
+    return axes @ centre, Rotation.from_matrix(axes) * turn
 
 
 def big_photo() -> float:
