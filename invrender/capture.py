@@ -41,7 +41,7 @@ NO_CURVE = 0.2  # share of saturated pixels from which gain and gamma cannot be 
 POOR = 0.01  # residual of the ideal pattern from which the screen itself is in doubt
 # Shift in sizes of the sample, and tilt in degrees, that an error of the ball's place, a hundredth
 # of its radius, cannot explain: a smaller one is taken for such an error.
-MOVED = (0.055, 2.5)
+MOVED = (0.022, 1.0)
 
 
 @dataclass(frozen=True)
