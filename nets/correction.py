@@ -27,6 +27,7 @@ from nets.model import MAX_SIGMA, MIN_SIGMA, Batch, Config, encode, slope_normal
 NOISE = (0.04, 0.01)  # of the photo: relative to the pixel, and to a white plane
 ALBEDO_CORRELATION = (0.9, 0.95)  # between the colours of k_d's error, and of k_s's
 REACH = (0.1, 0.1, 0.1, 0.2)  # of a step, in the outputs' unit: k_d, k_s, ρ, slopes
+DOUBT = 3.0  # logit by which a fresh correction keeps to the network's maps and not to the lobes
 INPUTS = 3 * 4 + 9 + 4 + 9 + 6 + 9 + 1 + 2 + 7
 
 
@@ -106,8 +107,8 @@ class Correction(nn.Module):
         self.multiple = 1 << levels
         self.encoder = Encoder(INPUTS, width, config.encoder)
         self.middle = blocks(width << levels, config.middle)
-        self.decoder = Decoder(9 + 4, width, config.decoder)
-        nn.init.zeros_(self.decoder.ending.weight)  # a fresh one changes nothing
+        self.decoder = Decoder(9 + 4 + 7, width, config.decoder)
+        nn.init.zeros_(self.decoder.ending.weight)  # a fresh one changes next to nothing
         nn.init.zeros_(self.decoder.ending.bias)  # type: ignore[arg-type]
         reach = torch.tensor(REACH).repeat_interleave(torch.tensor([3, 3, 1, 2]))
         self.register_buffer("reach", reach[:, None, None], persistent=False)
@@ -119,12 +120,15 @@ class Correction(nn.Module):
         x = pad_to(x, self.multiple).contiguous(memory_format=torch.channels_last)
         y, skips = self.encoder(x)
         y = self.decoder(self.middle(y), skips)[..., :height, :width]
+        # Some of the way to the lobes, by the network's judgement, and a step of its own.
+        towards = torch.sigmoid(y[:, 13:] - DOUBT) * (batch["lobes"] - batch["theta"][:, :7])
         theta = batch["theta"] + self.reach * y[:, :9]
+        theta = torch.cat([theta[:, :7] + towards, theta[:, 7:]], 1)
         diffuse, specular, roughness = theta[:, :3], theta[:, 3:6], theta[:, 6:7]
         if not self.training:
             diffuse, specular = diffuse.clamp(0, 1), specular.clamp(0, 1)
             roughness = roughness.clamp(0.02, 1)
-        sigma = batch["sigma0"].clamp(MIN_SIGMA, MAX_SIGMA) * torch.exp(y[:, 9:].clamp(-3, 2))
+        sigma = batch["sigma0"].clamp(MIN_SIGMA, MAX_SIGMA) * torch.exp(y[:, 9:13].clamp(-3, 2))
         sigma = (sigma * self.calibration[:, None, None]).clamp(MIN_SIGMA, MAX_SIGMA)
         return {
             "normal": slope_normal(theta[:, 7:]), "diffuse": diffuse,
