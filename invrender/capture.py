@@ -37,6 +37,7 @@ SATURATED = 0.01  # share of saturated pixels from which it is told, and the scr
 # Residual of the ideal pattern from which the ball shows another pattern, or is none: nine
 # hard simulated balls had at most 0.12, nine wrong ones at least 0.29.
 NO_PATTERN = 0.22
+SURE = 0.75  # confidence from which a ball is one even if its pattern fits as badly
 NO_CURVE = 0.2  # share of saturated pixels from which gain and gamma cannot be told apart
 POOR = 0.01  # residual of the ideal pattern from which the screen itself is in doubt
 # Shift in sizes of the sample, and tilt in degrees, that an error of the ball's place, a hundredth
@@ -248,13 +249,6 @@ def extract_lights(capture: Capture, ball: Ball, height: int = 128) -> Lights:
     pattern = capture.pattern
     gain, fit = fit_gain(photo, rig, ball, pattern)
     fit["pattern_residual"] = fit["residual"]
-    if fit["residual"] > NO_PATTERN and ball.confidence < 1:
-        (x, y), r = ball.centre, ball.radius
-        raise InputError(
-            f"what looks like the mirror ball ({x:.0f}, {y:.0f}, radius {r:.0f} pixels) does not "
-            "show the pattern: check that the display shows it the right way round, or give the "
-            f"ball by hand, --ball {x:.0f},{y:.0f},{r:.0f} to keep this one"
-        )
     if fit["residual"] > POOR or fit["saturated"] > SATURATED:
         screen = fit_screen(photo, rig, ball, pattern, curve=fit["saturated"] < NO_CURVE)
         # It knows that a saturated pixel had at least so much light; `fit_gain` leaves it out.
@@ -270,6 +264,18 @@ def extract_lights(capture: Capture, ball: Ball, height: int = 128) -> Lights:
                 "residual": screen.residual, "gamma": float(np.mean(screen.gamma)),
                 "screen_shift": float(shift), "screen_tilt": float(tilt),
             }  # fmt: skip
+    # A display far from its place or with another curve explains a poor ideal fit, if it fits.
+    if (
+        fit["pattern_residual"] > NO_PATTERN
+        and (fit["residual"] > NO_PATTERN or ball.confidence < SURE)
+        and ball.confidence < 1
+    ):
+        (x, y), r = ball.centre, ball.radius
+        raise InputError(
+            f"what looks like the mirror ball ({x:.0f}, {y:.0f}, radius {r:.0f} pixels) does not "
+            "show the pattern: check that the display shows it the right way round, or give the "
+            f"ball by hand, --ball {x:.0f},{y:.0f},{r:.0f} to keep this one"
+        )
     fit["room_saturated"] = _room_saturated(photo, rig, ball)
     environment, coverage = unfold_environment(photo, rig, ball, height)
     environment = fill_environment(environment, coverage)
