@@ -167,8 +167,10 @@ def test_display_and_sensor_noise_are_small_and_seeded():
     assert pattern.min() >= 0 and pattern.max() <= 1
     shown = data.display(rng, pattern)
     assert shown.min() >= 0 and np.corrcoef(shown.ravel(), pattern.ravel())[0, 1] > 0.95
-    gain = data.fit_gain(pattern * np.array([1, 2, 3]), pattern, rng)
-    np.testing.assert_allclose(gain, [1, 2, 3], rtol=0.05)
+    # Two gains in three are known to 1%, the others as from a small JPEG.
+    gains = [data.fit_gain(pattern * np.array([1, 2, 3]), pattern, rng) for _ in range(200)]
+    error = np.abs(np.log(np.array(gains) / [1, 2, 3]))
+    assert np.median(error) < 0.02 and 0.05 < error.max() < 0.4
     image = np.full((32, 32, 3), 0.4)
     a, b = (data.sensor(np.random.default_rng(5), image) for _ in range(2))
     np.testing.assert_array_equal(a, b)
