@@ -1,7 +1,7 @@
 """The learned correction: one step from the network's maps towards the maps that explain the photo.
 
-Learned gradient descent (Andrychowicz et al. 2016; for materials, compare Bi et al. 2020 and
-MatFusion's guidance): a small network sees, pixel by pixel and in their neighbourhood, the photo,
+Learned gradient descent (Adler and Öktem 2017, "Solving ill-posed inverse problems using iterative
+deep neural networks"): a small network sees, pixel by pixel and in their neighbourhood, the photo,
 the maps so far with their expected errors, what the forward model makes of them, and the
 Gauss–Newton step that the forward model's exact Jacobian proposes, and beside them a second
 opinion: what all pixels of a material, fitted together, say of its lobe. It answers how far to go,
