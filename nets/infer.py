@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,15 +14,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from invrender.errors import InputError
+from invrender.lobes import fit_lobes
 from invrender.maps import Maps
+from invrender.prior import to_theta
+from invrender.refine import linearise
+from invrender.render import Tables, Unbiased
 from invrender.rig import Rig
 from nets.clues import light_inputs, white_level
 from nets.loader import PIXELS, positions
 from nets.model import MAPS, Batch
 from nets.store import load_weights
-
-if TYPE_CHECKING:
-    from invrender.render import Tables, Unbiased
 
 Array = NDArray[np.floating[Any]]
 
@@ -95,8 +96,6 @@ class Corrector:
     ) -> Estimate:
         """One step from an estimate towards what explains the photo (H, W, 3); ``clipped``: where
         it is saturated. The forward model is evaluated for a band of rows at a time."""
-        from invrender.lobes import fit_lobes
-
         lobes = fit_lobes(photo, prepared, samples)
 
         @lru_cache(maxsize=1)
@@ -123,9 +122,6 @@ def linearised(
     rows: slice = slice(None),
 ) -> dict[str, Array]:
     """The correction's inputs (`nets.correction`) for some rows, float32, without a batch axis."""
-    from invrender.prior import to_theta
-    from invrender.refine import linearise
-
     height, width = photo.shape[:2]
     theta = to_theta(estimate.maps)[rows]
     top = rows.indices(height)[0]
