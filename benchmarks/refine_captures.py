@@ -10,6 +10,7 @@ import io
 import os
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -35,6 +36,7 @@ from invrender.pattern import default_pattern
 from invrender.rig import Rig
 from invrender.simulate import simulate
 
+Array = Any
 HOLDOUT = Path(__file__).parents[1] / "nets" / "holdout.txt"
 FIRST_SEED = 90_000  # of procedural materials and rooms that nothing else uses
 GAIN = 2.0  # radiance of the screen's white
@@ -59,37 +61,52 @@ def make_captures(
     size: pixels a side of the maps; width: of the photos; spp: path tracer's samples. Without
     folders, materials and rooms are procedural. Capture k depends on k and these alone.
     """
-    found, found_rooms = held_out(materials, rooms)
     folders = [out / f"{k:03d}" for k in range(count)]
     for k, folder in enumerate(folders):
         if folder.exists():
             continue
-        rng = np.random.default_rng(FIRST_SEED + k)
-        if found:
-            maps = _material(found, k, size)
-        else:
-            maps = procedural_material(FIRST_SEED + k, size, size)
-        if found_rooms:
-            n = len(found_rooms)
-            room = read_environment(found_rooms[(k + k // n) % n], 256)
-            room = rotate_environment(room, float(rng.uniform(0, 2 * np.pi)))
-        else:
-            room = procedural_environment(FIRST_SEED + k, 256)
-        room = scale_environment(room, float(rng.uniform(0.1, 1.0)))
+        maps, room, rng = sample_and_room(k, size, materials, rooms)
         shift = np.clip(rng.normal(0, SHIFT, 3), -2 * SHIFT, 2 * SHIFT)
         tilt = np.clip(rng.normal(0, TILT, 3), -2 * TILT, 2 * TILT)
         rig = Rig(screen_shift=tuple(shift.tolist()), screen_tilt=tuple(tilt.tolist()))
-        out.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=out, prefix=".") as name:
-            new = Path(name) / "capture"
-            simulate(
-                new, maps, room, default_pattern(), rig,
-                gain=GAIN, width=width, spp=spp, noise=0.005, seed=k,
-            )  # fmt: skip
-            if k % 2:
-                to_jpeg(new, int(rng.integers(85, 97)))
-            os.replace(new, folder)
+        quality = int(rng.integers(85, 97)) if k % 2 else None
+        make_capture(folder, maps, room, rig, default_pattern(), width, spp, k, quality)
     return folders
+
+
+def sample_and_room(
+    k: int, size: int, materials: Path | None, rooms: Path | None, first: int = FIRST_SEED
+) -> tuple[Maps, Array, np.random.Generator]:
+    """The k-th material and room, and the random numbers of what else is drawn for them."""
+    found, found_rooms = held_out(materials, rooms)
+    rng = np.random.default_rng(first + k)
+    maps = _material(found, k, size) if found else procedural_material(first + k, size, size)
+    if found_rooms:
+        n = len(found_rooms)
+        room = read_environment(found_rooms[(k + k // n) % n], 256)
+        room = rotate_environment(room, float(rng.uniform(0, 2 * np.pi)))
+    else:
+        room = procedural_environment(first + k, 256)
+    return maps, scale_environment(room, float(rng.uniform(0.1, 1.0))), rng
+
+
+def make_capture(
+    folder: Path, maps: Maps, room: Array, rig: Rig, shown: Array, width: int, spp: int, seed: int,
+    quality: int | None = None,
+) -> None:  # fmt: skip
+    """Simulate a capture whose screen shows ``shown``, times `GAIN`, where it should show the
+    default pattern; quality: of a JPEG, exposed for the screen; None for linear EXR."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".") as name:
+        new = Path(name) / "capture"
+        simulate(
+            new, maps, room, shown, rig,
+            gain=GAIN, width=width, spp=spp, noise=0.005, seed=seed,
+        )  # fmt: skip
+        write_exr(new / "pattern.exr", default_pattern(), half=True)
+        if quality:
+            to_jpeg(new, quality, GAIN * float(shown.max()))
+        os.replace(new, folder)
 
 
 def _material(folders: list[Path], k: int, size: int) -> Maps:
@@ -103,10 +120,13 @@ def _material(folders: list[Path], k: int, size: int) -> Maps:
     return resize_maps(maps, size, size)
 
 
-def to_jpeg(folder: Path, quality: int) -> None:
-    """Turn a capture's photo into a JPEG in which the screen's image in the ball just fits."""
+def to_jpeg(folder: Path, quality: int, white: float) -> None:
+    """Turn a capture's photo into a JPEG in which the screen's image in the ball just fits.
+
+    white: the screen's greatest radiance.
+    """
     photo = read_image(folder / "photo.exr")
-    scale = np.float32(0.9 / (0.9 * GAIN))
+    scale = np.float32(1 / white)
     data = (linear_to_srgb(np.clip(photo * scale, 0, 1)) * 255 + 0.5).astype(np.uint8)
     with io.BytesIO() as file:
         Image.fromarray(data).save(file, "JPEG", quality=quality)
