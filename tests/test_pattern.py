@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from chromium import CHROMIUM, Page
+from PIL import Image
 from rich.console import Console
 
 from invrender.design import (
@@ -21,8 +24,10 @@ from invrender.design import (
     wheel,
 )
 from invrender.design.population import _shade
+from invrender.display import pattern_page
 from invrender.environments import procedural_environment, scale_environment
 from invrender.errors import InputError
+from invrender.guide import needed_focal
 from invrender.images import read_image
 from invrender.pattern import block_pattern, default_pattern, mirrored, resize_pattern
 from invrender.pattern_cli import add_parser
@@ -204,6 +209,7 @@ def test_command_writes_both_handednesses(tmp_path):
         ("-o", "missing/x.png"),
         ("-o", "x.png", "--size", 0),
         ("-o", "x.png", "--rig", "rig.toml"),
+        ("-o", "x.pdf", "--rig", "missing.toml"),
         ("-o", "x.png", "--optimise", "--rig", "missing.toml"),
         ("-o", "x.png", "--seed", -1),
     ],
@@ -222,3 +228,83 @@ def test_command_optimises_for_another_rig(tmp_path):
     pattern = read_image(tmp_path / "p.exr")
     assert pattern.shape == (1024, 1024, 3)
     assert pattern.min() >= 0 and pattern.max() <= 1 and pattern.std() > 0.2
+
+
+def test_png_for_a_device_has_its_size_and_is_mirrored(tmp_path):
+    assert run("-o", tmp_path / "a.png", "--ppi", 100) == 0
+    with Image.open(tmp_path / "a.png") as image:
+        assert image.size == (709, 709)  # 180 mm
+        assert image.info["dpi"] == pytest.approx((100, 100), abs=0.01)
+    assert np.allclose(read_image(tmp_path / "a.png")[:, ::-1], default_pattern(709), atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("words", "match"),
+    [
+        (("x.png", "--ppi", 0), "30 to 2000"),
+        (("x.html", "--ppi", float("nan")), "30 to 2000"),
+        (("x.png", "--ppi", 1999), "8192"),
+        (("x.exr", "--ppi", 100), "for .png and .html"),
+        (("x.html", "--size", 100), "--size is for"),
+        (("x.pdf", "--mirrored"), "no pattern"),
+    ],
+)
+def test_impossible_devices_are_refused(words, match, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=match):
+        run("-o", *words)
+    assert not list(tmp_path.iterdir())
+
+
+def test_guide_is_two_pages_of_a4_for_any_rig(tmp_path):
+    for k, rig in enumerate((RIG, replace(RIG, screen_size=0.5, screen_height=0.7))):
+        write_rig(tmp_path / "rig.toml", rig)
+        out = tmp_path / f"{k}.pdf"
+        assert run("-o", out, "--rig", tmp_path / "rig.toml") == 0
+        pages = re.findall(rb"/MediaBox \[ *0 0 ([\d.]+) ([\d.]+)", out.read_bytes())
+        assert len(pages) == 2
+        assert [float(p) / 72 * 25.4 for p in pages[0]] == pytest.approx((210, 297), abs=0.1)
+    # A 24 mm lens has a field of 71.6° across a 4:3 photo; the default sample needs 70° of it.
+    assert needed_focal(RIG) == pytest.approx(23.6, abs=0.1)
+
+
+def test_page_is_one_file_of_the_rigs_size(tmp_path):
+    write_rig(tmp_path / "rig.toml", replace(RIG, screen_size=0.15))
+    assert run("-o", tmp_path / "a.html", "--rig", tmp_path / "rig.toml") == 0
+    page = (tmp_path / "a.html").read_text()
+    assert 'data-mm="150"' in page and "http" not in page.replace("http-equiv", "")
+
+
+def test_page_shows_the_pattern_in_real_size(tmp_path):
+    if CHROMIUM is None:
+        pytest.skip("no Chromium here (apt-get install chromium)")
+    path = tmp_path / "a.html"
+    path.write_text(pattern_page(default_pattern(), 0.18))
+    page = Page(1300, 950)
+    try:
+        page.open(path)
+        box = "(e => [e.left, e.top, e.width, e.height])({}.getBoundingClientRect())"
+        page.js("setPpi(110)")
+        card = page.js(box.format('at("card")'))
+        assert card[2:] == pytest.approx([85.6 / 25.4 * 110, 53.98 / 25.4 * 110], abs=1)
+        page.js('at("show").click()')
+        x, y, w, h = page.js(box.format('at("pattern")'))
+        assert x == 0 and w == h == round(180 / 25.4 * 110)
+        assert y == pytest.approx((page.js("innerHeight") - h) / 2, abs=1)
+        # Right side of the screen, mirrored: what it shows at its left is the pattern's right.
+        page.screenshot(tmp_path / "a.png")
+        seen = read_image(tmp_path / "a.png")
+        assert np.allclose(seen[:, w + 2 :], 0)
+        middle = seen[int(y) : int(y) + h, :w]
+        assert np.abs(middle[:, ::-1] - default_pattern(w)).mean() < 0.01
+        page.js('at("pattern").click()')
+        assert page.js('getComputedStyle(at("panel")).display') != "none"
+        # It remembers the scale, and says when the pattern does not fit.
+        page.open(path)
+        assert page.js("state.ppi") == 110
+        page.js("setPpi(300)")
+        assert page.js('at("show").disabled') and "too large" in page.js('at("fits").textContent')
+        # A browser may refuse full screen without a touch.
+        assert not [p for p in page.problems if "requestFullscreen" not in str(p)]
+    finally:
+        page.close()
