@@ -30,7 +30,7 @@ from invrender.unfold import (
 )
 
 Array = NDArray[np.floating[Any]]
-PHOTO_NAMES = tuple(f"photo.{e}" for e in ("exr", "tif", "tiff", "png", "jpg", "jpeg"))
+PHOTO_NAMES = tuple(f"photo.{e}" for e in ("exr", "dng", "tif", "tiff", "png", "jpg", "jpeg"))
 MIN_PHOTO = 64
 
 SATURATED = 0.01  # share of saturated pixels from which it is told, and the screen fitted with care

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 import os
-import struct
 import tempfile
 import warnings
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,7 +15,6 @@ from typing import Any
 import numpy as np
 import OpenEXR
 import tifffile
-from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -27,9 +24,7 @@ Array = NDArray[np.floating[Any]]
 MAX_PIXELS = 100_000_000
 _ORIENTATION, _EXIF_IFD = 0x0112, 0x8769
 _EXPOSURE_TIME, _F_NUMBER, _ISO, _FOCAL_35MM = 0x829A, 0x829D, 0x8827, 0xA405
-# Offset and step (x0, y0, dx, dy) of the seven passes of an interlaced PNG.
-_ADAM7 = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2),
-          (0, 1, 1, 2))  # fmt: skip
+RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
 
 
 @dataclass(frozen=True)
@@ -75,7 +70,7 @@ def linear_to_srgb(x: Array) -> Array:
 
 
 def read_image(path: Path, *, linear: bool = False) -> Array:
-    """Read an EXR, PNG, TIFF or JPEG as (H, W, 3) float32 linear RGB.
+    """Read an EXR, PNG, TIFF, JPEG or camera raw as (H, W, 3) float32 linear RGB.
 
     Integer files (8 or 16 bits) are decoded from sRGB unless ``linear`` is set (roughness,
     normals); float files are linear. Grey becomes three equal channels, alpha is dropped, the EXIF
@@ -103,14 +98,19 @@ def _read(path: Path, linear: bool) -> Photo:
             head = f.read(32)
     except OSError:
         raise InputError(f"{path} cannot be read") from None
-    if path.suffix.lower() == ".exr":
+    suffix = path.suffix.lower()
+    if suffix == ".exr":
         photo = Photo(_read_exr(path))
+    elif suffix in RAW:
+        from invrender.raw import read_raw
+
+        image, tags = read_raw(path)
+        photo = Photo(image, 1.0, *_lens(tags, *image.shape[:2]))
     else:
-        exif = None
         if head[:4] in (b"II*\0", b"MM\0*"):
-            data, orientation = _read_tiff(path)
+            data, orientation, tags = _read_tiff(path)
         else:
-            data, orientation, exif = _read_pillow(path, head)
+            data, orientation, tags = _read_pillow(path, head)
         data = _upright(data, orientation)
         clip = None
         if data.dtype != np.float32:
@@ -120,8 +120,7 @@ def _read(path: Path, linear: bool) -> Photo:
             # JPEG rings around a saturated area: its pixels lie a little below white.
             clip = float(srgb_to_linear(np.array(250 / 255)))
         image = np.asarray(data, np.float32)
-        fov, exposure = _lens(exif, *image.shape[:2])
-        photo = Photo(image, clip, fov, exposure)
+        photo = Photo(image, clip, *_lens(tags, *image.shape[:2]))
     if not np.all(np.isfinite(photo.image)):
         raise InputError(f"{path} contains NaN or infinite pixels")
     return photo
@@ -166,7 +165,7 @@ def _rgb(data: NDArray[Any]) -> NDArray[Any]:
     return data[..., :3] if data.shape[-1] >= 3 else np.repeat(data[..., :1], 3, -1)
 
 
-def _read_pillow(path: Path, head: bytes) -> tuple[NDArray[Any], int, Image.Exif]:
+def _read_pillow(path: Path, head: bytes) -> tuple[NDArray[Any], int, dict[int, Any]]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
@@ -180,7 +179,7 @@ def _read_pillow(path: Path, head: bytes) -> tuple[NDArray[Any], int, Image.Exif
                     wide = im.mode.startswith("I")
                     data = np.asarray(im if wide else im.convert("RGB"))
                     data = _rgb(data.astype(np.uint16) if wide else data)
-            return data, int(exif.get(_ORIENTATION, 1) or 1), exif
+            return data, _orientation(exif.get(_ORIENTATION)), _exif_tags(exif)
     except InputError:
         raise
     except Image.DecompressionBombError:
@@ -193,19 +192,46 @@ def _read_pillow(path: Path, head: bytes) -> tuple[NDArray[Any], int, Image.Exif
         ) from None
 
 
-def _read_tiff(path: Path) -> tuple[NDArray[Any], int]:
+def _exif_tags(exif: Image.Exif) -> dict[int, Any]:
+    try:
+        return dict(exif.get_ifd(_EXIF_IFD))
+    except Exception:  # damaged EXIF must not cost the photo
+        return {}
+
+
+def _orientation(value: Any) -> int:
+    return int(value) if isinstance(value, (int, np.integer)) else 1
+
+
+def tiff_exif(page: tifffile.TiffPage) -> dict[int, Any]:
+    """The EXIF tags of a TIFF's page by number; none where they are damaged."""
+    try:
+        value = page.tags[_EXIF_IFD].value
+    except Exception:
+        return {}
+    found: dict[int, Any] = {}
+    for name, number in value.items() if isinstance(value, dict) else ():
+        if isinstance(number, tuple) and len(number) == 2 and number[1]:  # a fraction
+            number = number[0] / number[1]
+        if name in tifffile.TIFF.EXIF_TAGS:
+            found[int(tifffile.TIFF.EXIF_TAGS[name])] = number
+    return found
+
+
+def _read_tiff(path: Path) -> tuple[NDArray[Any], int, dict[int, Any]]:
     try:
         with tifffile.TiffFile(path) as f:
             page = f.pages[0]
             assert isinstance(page, tifffile.TiffPage)
             _check_size(path, page.imagewidth, page.imagelength)
             tag = page.tags.get(_ORIENTATION)
-            orientation = int(tag.value) if tag else 1
+            orientation = _orientation(tag.value if tag else 1)
+            tags = tiff_exif(page)
             if page.photometric == tifffile.PHOTOMETRIC.PALETTE or page.compression not in (
                 1, 5, 8, 32773, 32946
             ):  # fmt: skip
                 with Image.open(path) as im:
-                    return np.asarray(im.convert("RGB")), orientation
+                    return np.asarray(im.convert("RGB")), orientation, tags
             data = page.asarray()
             if page.planarconfig == 2 and data.ndim == 3:
                 data = np.moveaxis(data, 0, -1)
@@ -221,70 +247,19 @@ def _read_tiff(path: Path) -> tuple[NDArray[Any], int]:
         data = data.astype(np.float32)
     if data.dtype not in (np.uint8, np.uint16, np.float32) or data.ndim not in (2, 3):
         raise InputError(f"{path} is a TIFF of {data.dtype}; save it as 8 or 16 bits or as float")
-    return _rgb(data), orientation
+    return _rgb(data), orientation, tags
 
 
-def _read_png16(path: Path) -> NDArray[np.uint16]:
-    """Decode a 16-bit PNG (Pillow reduces the colour ones to 8 bits). W3C PNG 3rd ed., 7 to 9."""
-    blob = path.read_bytes()
-    width, height, _, kind, _, _, interlace = struct.unpack(">IIBBBBB", blob[16:29])
-    channels = {0: 1, 2: 3, 4: 2, 6: 4}[kind]
-    parts, at = [], 8
-    while at + 8 <= len(blob):
-        (length,) = struct.unpack(">I", blob[at : at + 4])
-        if blob[at + 4 : at + 8] == b"IDAT":
-            parts.append(blob[at + 8 : at + 8 + length])
-        at += 12 + length
-    passes = _ADAM7 if interlace else ((0, 0, 1, 1),)
-    sizes = [(-(-(height - y) // dy), -(-(width - x) // dx)) for x, y, dx, dy in passes]
-    step = 2 * channels
-    total = sum(h * (w * step + 1) for h, w in sizes if h > 0 and w > 0)
-    raw = np.frombuffer(zlib.decompressobj().decompress(b"".join(parts), total), np.uint8)
-    if raw.size < total:
-        raise ValueError("truncated")
-    image = np.zeros((height, width, channels), np.uint16)
-    start = 0
-    for (x, y, dx, dy), (h, w) in zip(passes, sizes, strict=True):
-        if h > 0 and w > 0:
-            size = h * (w * step + 1)
-            rows = raw[start : start + size].reshape(h, w * step + 1)
-            data = _unfilter(rows[:, 1:], rows[:, 0], step)
-            image[y::dy, x::dx] = data.view(">u2").reshape(h, w, channels)
-            start += size
-    return _rgb(image)  # type: ignore[no-any-return]
+def _read_png16(path: Path) -> NDArray[Any]:
+    """A 16-bit PNG by Mitsuba's reader: Pillow reduces the colour ones to 8 bits."""
+    from invrender.backend import BACKEND  # it must come before Mitsuba
 
+    import mitsuba as mi  # isort: skip
 
-def _unfilter(rows: NDArray[np.uint8], kinds: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
-    """Undo PNG's row filters, one anti-diagonal of pixels at a time: each needs only the two
-    diagonals before it, and all of one diagonal can be done at once."""
-    h, stride = rows.shape[0], rows.shape[1] + step
-    if kinds.max() > 4:
-        raise ValueError("unknown filter")
-    if not kinds.any():
-        return np.ascontiguousarray(rows)
-    out = np.zeros((h + 1, stride), np.uint8)  # with a row and a pixel of zeros before the image
-    out[1:, step:] = rows
-    flat = out.reshape(-1)
-    width = rows.shape[1] // step
-    chosen = [(kinds == k)[:, None] for k in range(5)]
-    for d in range(h + width - 1):
-        first, last = max(0, d - width + 1), min(h - 1, d)
-        n = last - first + 1
-
-        def view(row: int, column: int, n: int = n) -> NDArray[np.uint8]:
-            return as_strided(flat[row * stride + column * step :], (n, step), (stride - step, 1))
-
-        here = view(first + 1, d - first + 1)
-        left, up = view(first + 1, d - first), view(first, d - first + 1)
-        a, b = left.astype(np.int16), up.astype(np.int16)
-        c = view(first, d - first).astype(np.int16)
-        pa, pb, pc = np.abs(b - c), np.abs(a - c), np.abs(a + b - 2 * c)
-        paeth = np.where((pa <= pb) & (pa <= pc), a, np.where(pb <= pc, b, c))
-        is_ = [m[first : last + 1] for m in chosen]
-        add = np.where(is_[1], a, 0) + np.where(is_[2], b, 0)
-        add = add + np.where(is_[3], (a + b) >> 1, 0) + np.where(is_[4], paeth, 0)
-        here += add.astype(np.uint8)
-    return np.ascontiguousarray(out[1:, step:])
+    if mi.variant() is None:
+        mi.set_variant(f"{BACKEND}_ad_rgb")
+        mi.set_log_level(mi.LogLevel.Error)
+    return _rgb(np.array(mi.Bitmap(str(path))))
 
 
 def _upright(data: NDArray[Any], orientation: int) -> NDArray[Any]:
@@ -298,14 +273,8 @@ def _upright(data: NDArray[Any], orientation: int) -> NDArray[Any]:
     return data
 
 
-def _lens(exif: Image.Exif | None, height: int, width: int) -> tuple[float | None, float | None]:
+def _lens(tags: dict[int, Any], height: int, width: int) -> tuple[float | None, float | None]:
     """Field of view in degrees and relative exposure in seconds, None where EXIF is silent."""
-    if exif is None:
-        return None, None
-    try:
-        tags = exif.get_ifd(_EXIF_IFD)
-    except Exception:  # damaged EXIF must not cost the photo
-        return None, None
 
     def positive(tag: int) -> float | None:
         value = tags.get(tag)

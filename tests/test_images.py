@@ -21,6 +21,9 @@ from invrender.images import (
     write_png,
 )
 
+# Offset and step (x0, y0, dx, dy) of the seven passes of an interlaced PNG.
+ADAM7 = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2),
+         (0, 1, 1, 2))  # fmt: skip
 RNG = np.random.default_rng(3)
 RGB16 = RNG.integers(0, 65536, (23, 17, 3)).astype(np.uint16)
 RAMP = (np.arange(48)[:, None, None] * 20 + np.arange(64)[None, :, None] * 2).repeat(3, -1)
@@ -32,7 +35,7 @@ def png16(path: Path, data: np.ndarray, filters: list[int], interlace: bool = Fa
     kind = {1: 0, 2: 4, 3: 2, 4: 6}[data.shape[2]]
     step = 2 * data.shape[2]
     raw = bytearray()
-    for x0, y0, dx, dy in images._ADAM7 if interlace else ((0, 0, 1, 1),):
+    for x0, y0, dx, dy in ADAM7 if interlace else ((0, 0, 1, 1),):
         part = data[y0::dy, x0::dx]
         before = np.zeros(part.shape[1] * step, int)
         for y in range(part.shape[0] if part.shape[1] else 0):
