@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -49,12 +50,13 @@ class Photo:
     def width(self) -> int:
         return int(self.image.shape[1])
 
-    @property
+    @cached_property
     def clipped(self) -> NDArray[np.bool_]:
         """(H, W): pixels where at least one channel is saturated."""
         if self.clip_level is None:
             return np.zeros(self.image.shape[:2], bool)
-        return np.asarray((self.image >= self.clip_level).any(-1))
+        r, g, b = (self.image[..., k] >= self.clip_level for k in range(3))
+        return np.asarray(r | g | b)
 
 
 def srgb_to_linear(x: Array) -> Array:
@@ -171,10 +173,12 @@ def _read_pillow(path: Path, head: bytes) -> tuple[NDArray[Any], int, dict[int, 
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             with Image.open(path) as im:
                 _check_size(path, im.width, im.height)
-                exif = im.getexif()
                 if head[:8] == b"\x89PNG\r\n\x1a\n" and head[24] == 16:
+                    # Only what lies before the pixels: Pillow decodes them all to look behind.
+                    exif = im.getexif() if "exif" in im.info else Image.Exif()
                     data = _read_png16(path)
                 else:
+                    exif = im.getexif()
                     im.load()
                     wide = im.mode.startswith("I")
                     data = np.asarray(im if wide else im.convert("RGB"))
