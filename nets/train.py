@@ -145,35 +145,38 @@ class _Averaged:
 
 
 @torch.no_grad()
-def validate(
+def errors(
     network: AnyNetwork, folder: Path, device: torch.device, batch: int = 8, limit: int = 256
-) -> dict[str, float]:
-    """RMSE of each map over all pixels and captures of a folder's first shards together, their
-    average; coverage_X, the share of the true values within one sigma; scale_X, the factor on sigma
-    that makes it 68%."""
+) -> tuple[dict[str, float], dict[str, Tensor]]:
+    """For each map its RMSE over all pixels and captures of a folder's first shards together, and
+    |error| / sigma of some of the pixels, flat."""
     network.eval()
     squares = dict.fromkeys(MAPS, 0.0)
-    inside: dict[str, list[Tensor]] = {k: [] for k in MAPS}
+    ratios: dict[str, list[Tensor]] = {k: [] for k in MAPS}
     seen = 0
     for path in shards(folder):
         for b in read_batch(path, batch):
             b = {k: v.to(device) for k, v in b.items()}
-            errors = compare(network(b), b)
-            for k, (square, ratio) in errors.items():
+            for k, (square, ratio) in compare(network(b), b).items():
                 squares[k] += float(square.double().mean((1, 2, 3)).sum())
-                inside[k].append(ratio[..., ::4, ::4].flatten().cpu())
+                ratios[k].append(ratio[..., ::4, ::4].flatten().cpu())
             seen += len(b["photo"])
             if seen >= limit:
                 break
         if seen >= limit:
             break
-    out = {k: math.sqrt(squares[k] / max(seen, 1)) for k in MAPS}
+    rmse = {k: math.sqrt(squares[k] / max(seen, 1)) for k in MAPS}
+    return rmse, {k: torch.cat(v) for k, v in ratios.items()}
+
+
+def validate(
+    network: AnyNetwork, folder: Path, device: torch.device, limit: int = 256
+) -> dict[str, float]:
+    """RMSE of each map and their average; coverage_X, the share of the true values within one
+    sigma."""
+    out, ratios = errors(network, folder, device, limit=limit)
     out["average"] = sum(out.values()) / len(MAPS)
-    for k in MAPS:
-        ratio = torch.cat(inside[k])
-        out[f"coverage_{k}"] = float((ratio < 1).float().mean())
-        out[f"scale_{k}"] = float(ratio.kthvalue(max(1, int(0.68 * len(ratio)))).values)
-    return out
+    return out | {f"coverage_{k}": float((v < 1).float().mean()) for k, v in ratios.items()}
 
 
 def baseline(folder: Path, limit: int = 256) -> dict[str, float]:
@@ -251,18 +254,13 @@ def run(
             means = {k: v / max(count, 1) for k, v in sums.items()}
             row = {"step": trainer.step, "seconds": trainer.seconds, "skipped": trainer.skipped}
             row |= {f"train_{k}": v for k, v in means.items()}
-            scales = []
             with trainer.averaged() as network:
                 for name, folder in valid.items():
                     result = validate(network, folder, trainer.device, limit=args.valid_count)
                     row |= {f"{name}_{k}": v for k, v in result.items()}
-                    scales.append([result[f"scale_{k}"] for k in MAPS])
             append_log(args.out / "log.csv", row)
-            if scales:  # the network's own stays at one; that of the mean weights is what is used
-                trainer.mean["calibration"] = torch.tensor(scales).mean(0).to(trainer.device)
             trainer.save({"hours": trainer.seconds / 3600, **row})
-            trainer.mean["calibration"] = torch.ones(4, device=trainer.device)
-            shown = {k: v for k, v in row.items() if not k.count("scale_") + k.count("coverage_")}
+            shown = {k: v for k, v in row.items() if "coverage_" not in k}
             print(" ".join(f"{k} {v:.4g}" for k, v in shown.items()), flush=True)
             plot_log(args.out / "log.csv", args.out / "curve.png")
         sums, count, start = {}, 0, time.perf_counter()

@@ -15,6 +15,7 @@ from invrender.images import write_exr  # noqa: E402
 from invrender.maps import constant_maps, write_maps  # noqa: E402
 from invrender.pattern import block_pattern  # noqa: E402
 from nets import data, draw, sheet, train  # noqa: E402
+from nets.calibrate import calibrate  # noqa: E402
 from nets.loader import batches, positions, read_batch, shards  # noqa: E402
 from nets.loss import MAPS, SPREAD, compare, total_loss, truth  # noqa: E402
 from nets.sheet import problems  # noqa: E402
@@ -342,12 +343,11 @@ def test_schedule():
 def test_calibration_and_baseline(folder):
     network = build("tiny")
     result = train.validate(network, folder, torch.device("cpu"))
-    scaled = torch.tensor([result[f"scale_{k}"] for k in MAPS])
-    network.calibration.copy_(scaled)
+    calibrate(network, [folder])
     again = train.validate(network, folder, torch.device("cpu"))
-    for k in MAPS:
+    for k, scale in zip(MAPS, network.calibration.tolist(), strict=True):
         assert again[k] == pytest.approx(result[k])
-        if 0.01 < float(scaled[MAPS.index(k)]) < 3:  # sigma is limited
+        if 0.01 < scale < 3:  # sigma is limited
             assert again[f"coverage_{k}"] == pytest.approx(0.68, abs=0.03)
     guess = train.baseline(folder)
     assert 0.02 < guess["normal"] < 0.3 and 0.02 < guess["diffuse"] < 0.4
