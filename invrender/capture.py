@@ -152,13 +152,7 @@ def crop_sample(photo: Photo, rig: Rig, size: int = 256) -> Array:
     if size < 1:
         raise InputError(f"the sample's size must be at least one pixel, got {size}")
     h, w = photo.height, photo.width
-    corners = rig.project(rig.sample_points(2, 2) * 2, h, w)
-    if not (
-        np.isfinite(corners).all()
-        and (corners >= -0.5).all()
-        and (corners <= np.array([w, h]) + 0.5).all()
-    ):
-        raise InputError("the sample reaches beyond the photo: check the rig's sizes and fov")
+    corners = sample_corners(photo, rig)
     low, high = corners.reshape(-1, 2).min(0), corners.reshape(-1, 2).max(0)
     x0, y0 = np.maximum(np.floor(low).astype(int) - 8, 0)
     x1, y1 = np.minimum(np.ceil(high).astype(int) + 8, [w, h])
@@ -173,6 +167,31 @@ def crop_sample(photo: Photo, rig: Rig, size: int = 256) -> Array:
         plane = ndimage.map_coordinates(crop[..., c], at, order=order, mode="nearest")
         planes.append(plane.reshape(size, samples, size, samples).mean((1, 3)))
     return np.maximum(np.stack(planes, -1), 0).astype(np.float32)
+
+
+def crop_mask(photo: Photo, rig: Rig, size: int) -> NDArray[np.bool_]:
+    """(size, size): pixels of the sample's crop that a saturated photo pixel touches."""
+    if not photo.clipped.any():
+        return np.zeros((size, size), bool)
+    wide = ndimage.maximum_filter(photo.clipped, 3).astype(np.float32)
+    mask = np.broadcast_to(wide[..., None], (*wide.shape, 3))
+    return crop_sample(Photo(mask), rig, size)[..., 0] > 0.05
+
+
+def sample_corners(photo: Photo, rig: Rig) -> Array:
+    """The sample's corners in photo pixels, (2, 2, 2).
+
+    Raises `InputError` if the sample is not whole in the photo.
+    """
+    h, w = photo.height, photo.width
+    corners = rig.project(rig.sample_points(2, 2) * 2, h, w)
+    if not (
+        np.isfinite(corners).all()
+        and (corners >= -0.5).all()
+        and (corners <= np.array([w, h]) + 0.5).all()
+    ):
+        raise InputError("the sample reaches beyond the photo: check the rig's sizes and fov")
+    return corners
 
 
 def fit_gain(photo: Photo, rig: Rig, ball: Ball, pattern: Array) -> tuple[Array, dict[str, float]]:

@@ -12,22 +12,27 @@ import numpy as np
 from PIL import Image, ImageDraw
 from rich.console import Console
 
-from invrender.ball import find_ball
 from invrender.capture import (
     Capture,
     Lights,
     check_photo,
+    crop_mask,
     extract_lights,
     light_warnings,
     load_capture,
+    sample_corners,
 )
+from invrender.environments.sphere import irradiance
 from invrender.errors import InputError
 from invrender.images import Photo, atomic_path, linear_to_srgb, read_photo, write_exr
 from invrender.mirror import Ball, horizon_points, mirror_normals, outline_points
-from invrender.pattern import default_pattern
+from invrender.pattern import default_pattern, resize_pattern
 from invrender.rig import Rig
+from invrender.upright import find_upright_ball
 
 SHOWN = 1600  # pixels, the longer side of the annotated picture
+BLURRED = 0.03  # of the ball's radius, the camera's blur from which it is told
+WEAK = 0.1  # share of the sample's light that the pattern gives, likewise; designed for 0.2 or more
 
 
 def add_parser(commands: Any, ball: Any) -> None:
@@ -58,9 +63,10 @@ def run(args: argparse.Namespace, console: Console) -> int:
         check_photo(photo, str(args.capture))
         rig = Rig() if photo.fov is None else Rig(fov=photo.fov)
         capture = Capture(photo, rig, default_pattern())
-    ball = find_ball(capture.photo, capture.rig, args.ball)
+    capture, ball, turned = find_upright_ball(capture, args.ball)
     lights = extract_lights(capture, ball)
     numbers = summary(capture, ball, lights)
+    numbers["warnings"] = [*turned, *numbers["warnings"]]
     if args.out is not None:
         args.out.mkdir(parents=True, exist_ok=True)
         with atomic_path(args.out / "inspect.png") as path:
@@ -82,7 +88,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
         f"screen  radiance of white {gain}; pattern fits to {fit['residual']:.1%}, display's gamma "
         f"{fit['gamma']:.2f}, {fit['saturated']:.0%} saturated",
         f"room    {numbers['coverage']:.0%} of the sky seen, {numbers['room_saturated']:.1%} of it "
-        "saturated",
+        f"saturated; the pattern gives {numbers['pattern_share']:.0%} of the light on the sample",
     ):
         console.print(line, highlight=False, soft_wrap=True)
     for warning in numbers["warnings"]:
@@ -94,6 +100,7 @@ def summary(capture: Capture, ball: Ball, lights: Lights) -> dict[str, Any]:
     """Everything found, as plain numbers; lengths in metres, angles in degrees."""
     sky = lights.coverage[: len(lights.coverage) // 2]
     sine = np.sin((np.arange(len(sky)) + 0.5) * math.pi / len(lights.coverage))
+    share = pattern_share(lights)
     return {
         "photo": [capture.photo.width, capture.photo.height],
         "fov": capture.rig.fov,
@@ -107,8 +114,52 @@ def summary(capture: Capture, ball: Ball, lights: Lights) -> dict[str, Any]:
         "fit": lights.fit,
         "coverage": float((sky.mean(1) * sine).sum() / sine.sum()),
         "room_saturated": lights.fit["room_saturated"],
-        "warnings": light_warnings(lights),
+        "pattern_share": share,
+        "exposure": capture.photo.exposure,
+        "warnings": [*light_warnings(lights), *_photo_warnings(capture, ball, lights, share)],
     }
+
+
+def pattern_share(lights: Lights) -> float:
+    """Share of the light on the middle of the sample that comes from the screen, in [0, 1]."""
+    e_x, e_y = lights.rig.screen_edges
+    shown = resize_pattern(lights.pattern, 32).mean(-1)
+    t = (np.arange(32) + 0.5) / 32
+    place = lights.rig.screen_corner + t[None, :, None] * e_x + (1 - t)[:, None, None] * e_y
+    down = np.cross(e_y, e_x) / 32**2  # of one cell, as long as its area
+    distance = np.linalg.norm(place, axis=-1)
+    cosines = np.maximum(-place @ down, 0) * np.maximum(place[..., 2], 0) / distance**4
+    screen = float(np.mean(lights.gain) * (shown * cosines).sum())
+    room = float(irradiance(lights.environment).mean())
+    return screen / max(screen + room, 1e-30)
+
+
+def _photo_warnings(capture: Capture, ball: Ball, lights: Lights, share: float) -> list[str]:
+    """What is doubtful about a photo apart from its lights, a sentence each."""
+    warnings = []
+    saturated = 0.0
+    try:
+        sample_corners(capture.photo, lights.rig)
+        saturated = float(crop_mask(capture.photo, lights.rig, 128).mean())
+    except InputError as error:
+        warnings.append(str(error))
+    if saturated > 0:
+        warnings.append(
+            f"{saturated:.1%} of the sample is saturated; the photo tells nothing there: expose "
+            "shorter"
+        )
+    blur = lights.fit["blur"]
+    if blur > BLURRED * ball.radius:
+        warnings.append(
+            f"the photo is blurred by {blur:.1f} pixels in the ball, too much to read the pattern "
+            "well: focus, hold still, or go closer"
+        )
+    if share < WEAK:
+        warnings.append(
+            f"the pattern gives only {share:.0%} of the light on the sample: turn the display's "
+            "brightness up or the room's light down"
+        )
+    return warnings
 
 
 def annotate(photo: Photo, rig: Rig, ball: Ball) -> Image.Image:

@@ -52,9 +52,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
     suffix = args.out.suffix.lower()
     if suffix not in (".png", ".exr", ".html", ".pdf"):
-        raise InputError(
-            f"{args.out}: the pattern is a .png, .exr or .html, the guide a .pdf"
-        )
+        raise InputError(f"{args.out}: the pattern is a .png, .exr or .html, the guide a .pdf")
     size = 1024 if args.size is None else args.size
     if not 1 <= size <= 8192:
         raise InputError("the pattern's size must be between 1 and 8192")

@@ -12,25 +12,23 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
-from invrender.ball import find_ball
 from invrender.capture import (
     Capture,
     Lights,
+    crop_mask,
     crop_sample,
     extract_lights,
     light_warnings,
     load_capture,
 )
 from invrender.errors import InputError
-from invrender.images import Photo
 from invrender.maps import Maps, map_errors
 from invrender.materials import resize_maps, turn_maps
 from invrender.mirror import Ball
 from invrender.report import Report
 from invrender.results import write_results
-from invrender.rig import Rig
+from invrender.upright import find_upright_ball
 
 if TYPE_CHECKING:  # Dr.Jit compiles where the refinement is imported
     from invrender.refine import Refined
@@ -46,7 +44,7 @@ class Seen:
     """What a capture tells before its maps: the lights, and the sample as its photo shows it.
 
     photo: (size, size, 3), linear radiance; clipped: (size, size), where it is saturated. ball:
-    None where the lights were known without one.
+    None where the lights were known without one. turned: what was turned upright, a sentence each.
     """
 
     capture: Capture
@@ -54,6 +52,7 @@ class Seen:
     lights: Lights
     photo: Array
     clipped: NDArray[np.bool_]
+    turned: Sequence[str] = ()
 
     def prepare(self, turn: int = 0) -> Any:
         """The forward model of these lights, turned by quarters about the sample's normal."""
@@ -101,11 +100,12 @@ def see(
     with stage("read"):
         capture = load_capture(folder)
     found = None
+    turned: list[str] = []
     if environment is not None and gain is not None:
         lights = _known_lights(capture, environment, gain)
     else:
         with stage("ball"):
-            found = find_ball(capture.photo, capture.rig, ball)
+            capture, found, turned = find_upright_ball(capture, ball)
         with stage("lights"):
             lights = extract_lights(capture, found)
         if environment is not None:
@@ -115,7 +115,7 @@ def see(
     with stage("crop"):
         photo = crop_sample(capture.photo, lights.rig, size)
         clipped = crop_mask(capture.photo, lights.rig, size)
-    return Seen(capture, found, lights, photo, clipped)
+    return Seen(capture, found, lights, photo, clipped, turned)
 
 
 def _rgb(gain: Any) -> Array:
@@ -290,15 +290,6 @@ def _networks() -> tuple[Any, Any]:
     return Reconstructor(), Corrector()
 
 
-def crop_mask(photo: Photo, rig: Rig, size: int) -> NDArray[np.bool_]:
-    """(size, size): pixels of the sample's crop that a saturated photo pixel touches."""
-    if not photo.clipped.any():
-        return np.zeros((size, size), bool)
-    mask = np.repeat(photo.clipped[..., None].astype(np.float32), 3, -1)
-    wide = ndimage.maximum_filter(mask, (3, 3, 1))
-    return crop_sample(Photo(wide), rig, size)[..., 0] > 0.05
-
-
 def _photo_error(picture: Array, photo: Array, clipped: NDArray[np.bool_]) -> float:
     """RMS difference over the photo's mean, where the photo is not saturated."""
     seen = ~clipped if not clipped.all() else np.ones_like(clipped)
@@ -307,7 +298,7 @@ def _photo_error(picture: Array, photo: Array, clipped: NDArray[np.bool_]) -> fl
 
 
 def _warnings(seen: Seen, error: float, result: Refined) -> list[str]:
-    warnings = light_warnings(seen.lights)
+    warnings = [*seen.turned, *light_warnings(seen.lights)]
     clipped, fit = seen.clipped, seen.lights.fit
     if fit.get("screen_shift", 0) > FAR_OFF * seen.lights.rig.screen_size:
         warnings.append(
