@@ -40,10 +40,14 @@ MIN_CONFIDENCE = 0.5
 MIRROR_WEIGHT = 1.0
 OUTLINE_WEIGHT = 0.5  # of the outline beside the horizon: a mirror pales into the table there
 TOE = 0.1  # added to radiance over its median before the logarithm
-TILT_PRIOR = 0.5  # of the camera, degrees; a wider one lets the horizon's errors through
-OUTLINE_SHARE = 0.3  # of an outline's edge beside a horizon's
-POLISHED = (0.97, 1.0, 1.03)  # radii, over the one found, from which the last fit starts
-CORRELATED = 10.0  # residuals side by side that tell the same
+TILT_PRIOR = 0.7  # of the camera, degrees
+RIM_REACH = 2.0  # radii from the ball's centre to which its rim is compared with the table
+LENS = 0.6  # pixels of blur that the camera is taken to have
+CORRELATED, RIM_CORRELATED = 10.0, 20.0  # residuals side by side that tell the same
+HORIZON = 0.5  # pixels; how closely the horizon's edge tells the horizon, at best
+# Level of blur, steps, and the radii tried before them, over the one so far.
+POLISH = ((2, 3, np.linspace(0.94, 1.06, 13)), (1, 3, np.linspace(0.96, 1.04, 9)),
+          (0, 4, np.linspace(0.98, 1.02, 9)))  # fmt: skip
 BLURS = (0.7, 1.4, 2.8, 5.6, 11.2)  # of the levels, in the view's pixels
 
 
@@ -83,9 +87,8 @@ def find_ball(photo: Photo, rig: Rig, manual: tuple[float, float, float] | None 
         raise InputError("no mirror ball found: the photo shows nothing where the rig puts it")
     found = make_ball(rig, np.array([theta[0], theta[1], 0.0]), theta[2], size)
     confidence = _confidence(view, rig, theta)
-    fine = _view(photo, np.asarray(found.centre), 1.6 * found.radius, found.radius / 160)
-    fits = [_polish(fine, rig, theta * [1, 1, k]) for k in POLISHED]
-    theta, tilted = max(fits, key=lambda fit: _score(fine, fit[1], fit[0], 240)[0])
+    fine = _view(photo, np.asarray(found.centre), 2.4 * found.radius, found.radius / 160)
+    theta, tilted = _polish(fine, rig, theta)
     seen = make_ball(tilted, np.array([theta[0], theta[1], 0.0]), theta[2], size, confidence)
     ball = replace(place_ball(rig, size, *seen.centre, seen.radius), confidence=confidence)
     (x, y), r = ball.centre, ball.radius
@@ -334,11 +337,13 @@ def _climb(view: _View, rig: Rig, start: Array, blur: int, reach: float, evaluat
 def _polish(view: _View, rig: Rig, theta: Array, reach: float = 0.05) -> tuple[Array, Rig]:
     """Sub-pixel (x, y, radius) by robust least squares, Gauss–Newton, and the rig they hold in.
 
-    Residuals are the distances along the normals of horizon and outline to the strongest edge
-    within ``reach`` radii, and the differences between the rim and the table it mirrors (which know
-    the outline's place even where it is no edge, in a contact shadow). Each kind is scaled by its
-    own spread and weighted as by a Cauchy distribution. The camera's tilt is fitted as well, within
-    `TILT_PRIOR`: by a degree it moves the horizon against the outline by a hundredth of the radius.
+    Residuals are the differences between the rim and the table that it mirrors, and the distances
+    from the horizon to the strongest edge within ``reach`` radii; the outline itself is no edge in
+    a contact shadow. Each kind is scaled by its own spread and weighted as by a Cauchy
+    distribution. Three levels of blur, coarse to fine; at each the radius is searched first, since
+    a contact shadow, a valley with the outline at its floor, has no slope that leads there. The
+    camera's tilt is fitted as well, within `TILT_PRIOR`: by a degree it moves the horizon against
+    the outline by a hundredth of the radius.
     """
 
     def tilted(p: Array) -> Rig:
@@ -352,41 +357,109 @@ def _polish(view: _View, rig: Rig, theta: Array, reach: float = 0.05) -> tuple[A
     follow = np.eye(5)
     follow[3, 1], follow[4, 0] = aim, -aim
     p = np.array([*theta, 0.0, 0.0])
-    for turn in range(12):
-        blur = max(0, 2 - turn // 2)
-        near = max(2.0, reach * radius * 0.8**turn)
+    turn = 0
+    for blur, turns, scales in POLISH:
+        rim = _rim(math.hypot(BLURS[blur], LENS) / radius)
         here = tilted(p)
-        steps = unit[:, None] * follow
-        moves = [(tilted(p + d), (p + d)[:3]) for d in steps]
-        theta = p[:3]
-        curves = _curves(view, here, theta, 240)
-        shifted = [_curves(view, r, t, 240) for r, t in moves]
-        base, valid3 = _mirror_difference(view, here, theta, blur)
-        valid = np.repeat(valid3, 3)
-        base = base.reshape(-1)
-        mirror_slope = np.stack(
-            [_mirror_difference(view, r, t, blur)[0].reshape(-1) - base for r, t in moves], -1
-        )
-        offset = float(np.median(base[valid])) if valid.any() else 0.0
-        terms = [(base - offset, mirror_slope, valid * 1.0, 0.02)]
-        for k in (0, 2):
-            edge, strength = _edges(view, curves[k], curves[k + 1], near)
-            slope = np.stack([np.sum((m[k] - curves[k]) * curves[k + 1], -1) for m in shifted], -1)
-            terms.append((-edge, slope, strength * (1 if k == 0 else OUTLINE_SHARE), 0.1))
-        prior = (unit[3] / TILT_PRIOR) ** 2
-        matrix = np.diag([1e-9, 1e-9, 1e-9, prior, prior])
-        right = -prior * np.array([0, 0, 0, p[3], p[4]]) / unit[3]
-        for r, slope, weight, floor in terms:
-            if weight.sum() < 20:
-                continue
-            spread = max(floor, 1.48 * float(np.median(np.abs(r[weight > 0.1]))))
-            k2 = weight / (1 + (r / spread) ** 2) / spread**2 / CORRELATED
-            matrix = matrix + slope.T @ (slope * k2[:, None])
-            right = right - slope.T @ (k2 * r)
-        damped = matrix + np.diag(np.diag(matrix)) * 1e-3
-        step = np.clip(np.linalg.solve(damped, right), -10, 10)
-        p = p + step @ steps
+        tries = [p[:3] * [1, 1, k] for k in scales]
+        p[:3] = tries[int(np.argmin([_rim_cost(view, here, q, rim, blur) for q in tries]))]
+        for _ in range(turns):
+            here = tilted(p)
+            steps = unit[:, None] * follow
+            moves = [(tilted(p + d), (p + d)[:3]) for d in steps]
+            base, valid = _rim_difference(view, here, p[:3], rim, blur)
+            slope = np.stack(
+                [_rim_difference(view, r, q, rim, blur)[0] - base for r, q in moves], -1
+            )
+            offset = float(np.clip(np.median(base[valid]), -0.3, 0.3)) if valid.any() else 0.0
+            horizon, normal = _curves(view, here, p[:3], 240)[:2]
+            edge, strength = _edges(view, horizon, normal, max(2.0, reach * radius * 0.8**turn))
+            shifted = [_curves(view, r, q, 240)[0] - horizon for r, q in moves]
+            along = np.stack([np.sum(m * normal, -1) for m in shifted], -1)
+            prior = (unit[3] / TILT_PRIOR) ** 2
+            matrix = np.diag([1e-9, 1e-9, 1e-9, prior, prior])
+            right = -prior * np.array([0, 0, 0, p[3], p[4]]) / unit[3]
+            for r, columns, weight, floor, correlated in (
+                (base - offset, slope, valid * 1.0, 0.01, RIM_CORRELATED),
+                (-edge, along, strength, HORIZON, CORRELATED),
+            ):
+                if weight.sum() < 20:
+                    continue
+                spread = max(floor, 1.48 * float(np.median(np.abs(r[weight > 0.1]))))
+                k2 = weight / (1 + (r / spread) ** 2) / spread**2 / correlated
+                matrix = matrix + columns.T @ (columns * k2[:, None])
+                right = right - columns.T @ (k2 * r)
+            damped = matrix + np.diag(np.diag(matrix)) * 1e-3
+            p = p + np.clip(np.linalg.solve(damped, right), -10, 10) @ steps
+            turn += 1
     return p[:3], tilted(p)
+
+
+def _rim(sigma: float) -> tuple[Array, Array, Array]:
+    """Normals (16, 72, 3) of the rim that mirrors the table near it, (16, 72, 7, 3) of what a
+    blur of ``sigma`` radii mixes into each of them radially, and its weights (7,).
+
+    Radially the mirror shrinks the table up to twenty times, along the rim hardly.
+    """
+    sine = np.linspace(0.78, 0.992, 16)
+    k = np.linspace(-2, 2, 7)
+    weight = np.exp(-k * k / 2)
+    psi = np.arange(72) * (2 * np.pi / 72)
+
+    def normals(s: Array) -> Array:
+        return np.stack(
+            np.broadcast_arrays(
+                s * np.cos(psi)[:, None], s * np.sin(psi)[:, None], np.sqrt(1 - s * s)
+            ),
+            -1,
+        )
+
+    mixed = np.clip(sine[:, None, None] + k * sigma, 0.72, 0.9995)
+    return normals(sine[:, None, None])[:, :, 0], normals(mixed), weight / weight.sum()
+
+
+def _rim_difference(
+    view: _View, rig: Rig, theta: Array, rim: tuple[Array, Array, Array], blur: int
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Differences (n,) in log radiance between the rim and the table it mirrors, each channel.
+
+    As `_mirror_difference`, but averaged along the way in which the mirror shrinks the table, not
+    over a disc, which would mix the ball itself into the table beside it.
+    """
+    normal, mixed, weight = rim
+    position = np.array([theta[0], theta[1], 0.0])
+    point = position + theta[2] * mixed
+    ray = point - rig.camera
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    mirrored = ray - 2 * np.sum(ray * mixed, -1, keepdims=True) * mixed
+    down = np.minimum(mirrored[..., 2:], -0.02)
+    at = point - mirrored * (point[..., 2:] / down)
+    table = view.at(at, rig)
+    h, w = view.tone.shape[:2]
+    distance = np.linalg.norm(at - position, axis=-1) / theta[2]
+    shown = (mirrored[..., 2] < -0.03) & (table > 0).all(-1) & (table < [w, h]).all(-1)
+    share = (shown & (distance > 1.005) & (distance < RIM_REACH)) * weight
+    valid = share.sum(-1) > 0.8
+    share = share / np.maximum(share.sum(-1, keepdims=True), 1e-9)
+    table = np.where(share[..., None] > 0, table, 0).reshape(-1, 2)
+    expected = _look(view.levels, np.full(len(table), blur), table).reshape(*share.shape, 3)
+    expected = (expected * share[..., None]).sum(-2) * np.asarray(rig.ball_reflectance)
+    place = view.at(position + theta[2] * normal, rig).reshape(-1, 2)
+    seen = _look(view.levels, np.full(len(place), blur), place).reshape(expected.shape)
+    difference = np.log(seen + TOE) - np.log(expected + TOE)
+    return difference.reshape(-1), np.repeat(valid.reshape(-1), 3)
+
+
+def _rim_cost(
+    view: _View, rig: Rig, theta: Array, rim: tuple[Array, Array, Array], blur: int
+) -> float:
+    """Mean log(1 + square) of the rim's differences, without what they share."""
+    difference, valid = _rim_difference(view, rig, theta, rim, blur)
+    if valid.mean() < 0.15:
+        return math.inf
+    r = difference[valid]
+    r = r - np.clip(np.median(r), -0.3, 0.3)
+    return float(np.log1p((r / 0.03) ** 2).mean())
 
 
 def _edges(view: _View, curve: Array, normal: Array, reach: float) -> tuple[Array, Array]:
