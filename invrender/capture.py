@@ -258,6 +258,16 @@ def fit_gain(photo: Photo, rig: Rig, ball: Ball, pattern: Array) -> tuple[Array,
     return gain, fit
 
 
+def not_the_pattern(ball: Ball) -> InputError:
+    """What is wrong with a ball whose image of the screen is another's."""
+    (x, y), r = ball.centre, ball.radius
+    return InputError(
+        f"what looks like the mirror ball ({x:.0f}, {y:.0f}, radius {r:.0f} pixels) does not "
+        "show the pattern: check that the display shows it the right way round, or give the "
+        f"ball by hand, --ball {x:.0f},{y:.0f},{r:.0f} to keep this one"
+    )
+
+
 def extract_lights(capture: Capture, ball: Ball, height: int = 128) -> Lights:
     """Unfold the ball: the environment (``height`` rows) and the screen's pattern and gain."""
     photo, rig = capture.photo, capture.rig
@@ -289,12 +299,7 @@ def extract_lights(capture: Capture, ball: Ball, height: int = 128) -> Lights:
         and (fit["residual"] > NO_PATTERN or ball.confidence < SURE)
         and ball.confidence < 1
     ):
-        (x, y), r = ball.centre, ball.radius
-        raise InputError(
-            f"what looks like the mirror ball ({x:.0f}, {y:.0f}, radius {r:.0f} pixels) does not "
-            "show the pattern: check that the display shows it the right way round, or give the "
-            f"ball by hand, --ball {x:.0f},{y:.0f},{r:.0f} to keep this one"
-        )
+        raise not_the_pattern(ball)
     fit["room_saturated"] = _room_saturated(photo, rig, ball)
     environment, coverage = unfold_environment(photo, rig, ball, height)
     environment = fill_environment(environment, coverage)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from invrender.ball import find_ball
-from invrender.capture import Capture
+from invrender.capture import Capture, not_the_pattern
 from invrender.errors import InputError
 from invrender.images import Photo
 from invrender.mirror import Ball, place_ball
@@ -27,6 +27,10 @@ Array = NDArray[np.floating[Any]]
 CELLS = 24  # of the pattern as it is compared
 ALIKE = 0.7  # correlation from which the ball shows the pattern in another orientation ...
 BETTER = 0.3  # ... if it is that much higher than as it is
+UNLIKE = 0.5  # correlation below which it is another one; 25 hard simulated photos had 0.82
+    0.5  # correlation below which it shows another one (25 hard simulated photos: 0.82 or more)
+)
+FLAT = 0.05  # standard deviation of a pattern that has no sides to tell
 Circle = tuple[float, float, float]
 
 
@@ -36,9 +40,10 @@ def find_upright_ball(
     """`find_ball`, with photo and pattern turned as they should have been; and what was turned.
 
     ``manual`` is the ball's circle in the photo as it is. The capture comes back unchanged unless
-    the ball shows the pattern plainly in another orientation. Raises `InputError` as `find_ball`.
+    the ball shows the pattern plainly in another orientation. Raises `InputError` as `find_ball`,
+    and where a ball that was not given by hand shows something else.
     """
-    fallback: tuple[Capture, Ball] | None = None
+    fallback: tuple[Capture, Ball, float] | None = None
     problem: InputError | None = None
     photo = capture.photo
     # As it is; then with the field of view taken to be across the photo's other side.
@@ -61,11 +66,14 @@ def find_upright_ball(
         if usual > ALIKE:
             return here, ball, _told(first, 0, False)
         if first == 0:
-            fallback = here, ball
+            fallback = here, ball, usual
     if fallback is None:
         assert problem is not None
         raise _explained(problem, capture) from None
-    return *fallback, []
+    here, ball, usual = fallback
+    if manual is None and usual < UNLIKE and capture.pattern.std((0, 1)).max() > FLAT:
+        raise not_the_pattern(ball)
+    return here, ball, []
 
 
 def _orientation(capture: Capture, ball: Ball) -> tuple[tuple[int, int, bool], float, float]:
