@@ -28,8 +28,6 @@ CELLS = 24  # of the pattern as it is compared
 ALIKE = 0.7  # correlation from which the ball shows the pattern in another orientation ...
 BETTER = 0.3  # ... if it is that much higher than as it is
 UNLIKE = 0.5  # correlation below which it is another one; 25 hard simulated photos had 0.82
-    0.5  # correlation below which it shows another one (25 hard simulated photos: 0.82 or more)
-)
 FLAT = 0.05  # standard deviation of a pattern that has no sides to tell
 Circle = tuple[float, float, float]
 
