@@ -157,13 +157,7 @@ def table_irradiance(rig: Rig, environment: Array, screen: Array, cells: int = 2
     p = np.stack(np.broadcast_arrays(x[None, :], -x[:, None], 0.0), -1)
     k = 12
     part = resize_mean(screen, k)
-    e_x, e_y = rig.screen_edges
-    s = (np.arange(k) + 0.5) / k
-    q = rig.screen_corner + s[None, :, None] * e_x + (1 - s)[:, None, None] * e_y
-    normal = np.cross(e_y, e_x) / k**2  # downwards, as long as a cell's area
-    d = q[None, None] - p[:, :, None, None]
-    square = (d * d).sum(-1)
-    factor = np.maximum(d[..., 2], 0) * np.maximum(-(d @ normal), 0) / square**2
+    factor = rig.screen_cosines(p, k)
     light = np.einsum("ijkl,klc->ijc", factor, part)
     return np.asarray(room * (1 - factor.sum((2, 3)) / np.pi)[..., None] + light)
 

@@ -9,7 +9,6 @@ are kept in DIR/captures: a rerun only refines. Without folders, materials and r
 
 from __future__ import annotations
 
-import argparse
 import time
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from typing import Any
 import numpy as np
 from common import bar, markdown, write_results
 from matplotlib import pyplot as plt
-from refine_captures import make_captures
+from refine_captures import arguments, make_captures
 
 from invrender.maps import NAMES, Maps, map_errors
 from invrender.materials import resize_maps
@@ -134,12 +133,7 @@ def plot(results: dict[str, list[dict[str, Any]]], file: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--quick", action="store_true", help="two small captures, under a minute")
-    parser.add_argument("--materials", type=Path, help="folder of materials; the held-out are used")
-    parser.add_argument("--envs", type=Path, help="folder of environments; the held-out are used")
-    parser.add_argument("--count", type=int, default=24)
+    parser = arguments(__doc__, "two small captures, under a minute", 24)
     parser.add_argument("--init", choices=INITS, action="append", help="only this start")
     args = parser.parse_args()
     count, size, width, spp = (2, 96, 480, 8) if args.quick else (args.count, 256, 960, 32)

@@ -6,6 +6,7 @@ few millimetres and degrees from where ``rig.toml`` says; the camera stands wher
 
 from __future__ import annotations
 
+import argparse
 import io
 import os
 import tempfile
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 from invrender.environments import (
@@ -36,7 +38,7 @@ from invrender.pattern import default_pattern
 from invrender.rig import Rig
 from invrender.simulate import simulate
 
-Array = Any
+Array = NDArray[np.floating[Any]]
 HOLDOUT = Path(__file__).parents[1] / "nets" / "holdout.txt"
 FIRST_SEED = 90_000  # of procedural materials and rooms that nothing else uses
 GAIN = 2.0  # radiance of the screen's white
@@ -72,6 +74,17 @@ def make_captures(
         quality = int(rng.integers(85, 97)) if k % 2 else None
         make_capture(folder, maps, room, rig, default_pattern(), width, spp, k, quality)
     return folders
+
+
+def arguments(doc: str | None, quick: str, count: int) -> argparse.ArgumentParser:
+    """The command line of a benchmark on such captures, ``count`` of them unless it says so."""
+    parser = argparse.ArgumentParser(description=doc.splitlines()[0] if doc else None)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--quick", action="store_true", help=quick)
+    parser.add_argument("--materials", type=Path, help="folder of materials; the held-out are used")
+    parser.add_argument("--envs", type=Path, help="folder of environments; the held-out are used")
+    parser.add_argument("--count", type=int, default=count)
+    return parser
 
 
 def sample_and_room(

@@ -11,14 +11,13 @@ the nominal pattern and rig. Captures are kept in DIR/captures: a rerun only ref
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from common import bar, markdown, write_results
 from refine import measure, pooled
-from refine_captures import make_capture, sample_and_room
+from refine_captures import arguments, make_capture, sample_and_room
 
 from invrender.maps import NAMES
 from invrender.pattern import default_pattern
@@ -53,12 +52,7 @@ def make_captures(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--quick", action="store_true", help="one small sample, under a minute")
-    parser.add_argument("--materials", type=Path, help="folder of materials; the held-out are used")
-    parser.add_argument("--envs", type=Path, help="folder of environments; the held-out are used")
-    parser.add_argument("--count", type=int, default=8)
+    parser = arguments(__doc__, "one small sample, under a minute", 8)
     args = parser.parse_args()
     count, size, width, spp = (1, 96, 480, 8) if args.quick else (args.count, 256, 960, 32)
     rows: dict[str, list[dict[str, Any]]] = {}

@@ -247,18 +247,25 @@ def _mirror_difference(
     """
     normal, level = _RING
     level = np.minimum(level + blur, len(BLURS) - 1)
-    point = np.array([theta[0], theta[1], 0.0]) + theta[2] * normal
-    ray = point - rig.camera
-    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
-    mirrored = ray - 2 * np.sum(ray * normal, -1, keepdims=True) * normal
-    down = np.minimum(mirrored[:, 2:], -0.02)
-    table = view.at(point - mirrored * (point[:, 2:] / down), rig)
+    point, rise, at = _mirrored_table(rig, theta, normal)
+    table = view.at(at, rig)
     h, w = view.tone.shape[:2]
-    valid = (mirrored[:, 2] < -0.05) & (table > 0).all(-1) & (table < [w, h]).all(-1)
+    valid = (rise < -0.05) & (table > 0).all(-1) & (table < [w, h]).all(-1)
     table = np.where(valid[:, None], table, 0)
     expected = _look(view.levels, level, table) * np.asarray(rig.ball_reflectance)
     seen = _look(view.levels, np.full_like(level, blur), view.at(point, rig))
     return np.log(seen + TOE) - np.log(expected + TOE), valid
+
+
+def _mirrored_table(rig: Rig, theta: Array, normal: Array) -> tuple[Array, Array, Array]:
+    """Points (..., 3) of the ball with these normals, the z of the ray that each mirrors, and where
+    that meets the table, (..., 3)."""
+    point = np.array([theta[0], theta[1], 0.0]) + theta[2] * normal
+    ray = point - rig.camera
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    mirrored = ray - 2 * np.sum(ray * normal, -1, keepdims=True) * normal
+    down = np.minimum(mirrored[..., 2:], -0.02)
+    return point, mirrored[..., 2], point - mirrored * (point[..., 2:] / down)
 
 
 def _look(levels: Array, level: Array, at: Array) -> Array:
@@ -428,16 +435,11 @@ def _rim_difference(
     """
     normal, mixed, weight = rim
     position = np.array([theta[0], theta[1], 0.0])
-    point = position + theta[2] * mixed
-    ray = point - rig.camera
-    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
-    mirrored = ray - 2 * np.sum(ray * mixed, -1, keepdims=True) * mixed
-    down = np.minimum(mirrored[..., 2:], -0.02)
-    at = point - mirrored * (point[..., 2:] / down)
+    _, rise, at = _mirrored_table(rig, theta, mixed)
     table = view.at(at, rig)
     h, w = view.tone.shape[:2]
     distance = np.linalg.norm(at - position, axis=-1) / theta[2]
-    shown = (mirrored[..., 2] < -0.03) & (table > 0).all(-1) & (table < [w, h]).all(-1)
+    shown = (rise < -0.03) & (table > 0).all(-1) & (table < [w, h]).all(-1)
     share = (shown & (distance > 1.005) & (distance < RIM_REACH)) * weight
     valid = share.sum(-1) > 0.8
     share = share / np.maximum(share.sum(-1, keepdims=True), 1e-9)

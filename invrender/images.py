@@ -128,7 +128,8 @@ def _read(path: Path, linear: bool) -> Photo:
     return photo
 
 
-def _check_size(path: Path, width: int, height: int) -> None:
+def check_size(path: Path, width: int, height: int) -> None:
+    """Raise `InputError` for an image without pixels or with too many to be one."""
     if width < 1 or height < 1:
         raise InputError(f"{path} has no pixels")
     if width * height > MAX_PIXELS:
@@ -141,7 +142,7 @@ def _read_exr(path: Path) -> Array:
     try:
         with OpenEXR.File(str(path), header_only=True) as f:
             window = f.header()["dataWindow"]
-            _check_size(path, *(int(window[1][i]) - int(window[0][i]) + 1 for i in (0, 1)))
+            check_size(path, *(int(window[1][i]) - int(window[0][i]) + 1 for i in (0, 1)))
         with OpenEXR.File(str(path), separate_channels=True) as f:
             channels = {k: v.pixels for k, v in f.channels().items()}
     except InputError:
@@ -172,7 +173,7 @@ def _read_pillow(path: Path, head: bytes) -> tuple[NDArray[Any], int, dict[int, 
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             with Image.open(path) as im:
-                _check_size(path, im.width, im.height)
+                check_size(path, im.width, im.height)
                 if head[:8] == b"\x89PNG\r\n\x1a\n" and head[24] == 16:
                     # Only what lies before the pixels: Pillow decodes them all to look behind.
                     exif = im.getexif() if "exif" in im.info else Image.Exif()
@@ -227,7 +228,7 @@ def _read_tiff(path: Path) -> tuple[NDArray[Any], int, dict[int, Any]]:
         with tifffile.TiffFile(path) as f:
             page = f.pages[0]
             assert isinstance(page, tifffile.TiffPage)
-            _check_size(path, page.imagewidth, page.imagelength)
+            check_size(path, page.imagewidth, page.imagelength)
             tag = page.tags.get(_ORIENTATION)
             orientation = _orientation(tag.value if tag else 1)
             tags = tiff_exif(page)

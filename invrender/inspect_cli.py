@@ -122,14 +122,10 @@ def summary(capture: Capture, ball: Ball, lights: Lights) -> dict[str, Any]:
 
 def pattern_share(lights: Lights) -> float:
     """Share of the light on the middle of the sample that comes from the screen, in [0, 1]."""
-    e_x, e_y = lights.rig.screen_edges
     shown = resize_pattern(lights.pattern, 32).mean(-1)
-    t = (np.arange(32) + 0.5) / 32
-    place = lights.rig.screen_corner + t[None, :, None] * e_x + (1 - t)[:, None, None] * e_y
-    down = np.cross(e_y, e_x) / 32**2  # of one cell, as long as its area
-    distance = np.linalg.norm(place, axis=-1)
-    cosines = np.maximum(-place @ down, 0) * np.maximum(place[..., 2], 0) / distance**4
-    screen = float(np.mean(lights.gain) * (shown * cosines).sum())
+    screen = float(
+        np.mean(lights.gain) * (shown * lights.rig.screen_cosines(np.zeros(3), 32)).sum()
+    )
     room = float(irradiance(lights.environment).mean())
     return screen / max(screen + room, 1e-30)
 

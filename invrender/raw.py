@@ -10,7 +10,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from invrender.errors import InputError
-from invrender.images import MAX_PIXELS, tiff_exif
+from invrender.images import check_size, tiff_exif
 
 SATURATED = 0.99  # of the sensor's range
 
@@ -33,11 +33,7 @@ def read_raw(path: Path) -> tuple[NDArray[np.float32], dict[int, Any]]:
     try:
         with rawpy.imread(str(path)) as raw:
             sizes = raw.sizes
-            if sizes.width * sizes.height > MAX_PIXELS:
-                raise InputError(
-                    f"{path} has {sizes.width} × {sizes.height} pixels, more than the "
-                    f"{MAX_PIXELS:,} this program reads"
-                )
+            check_size(path, sizes.width, sizes.height)
             data = raw.postprocess(
                 gamma=(1, 1), no_auto_bright=True, use_camera_wb=True, output_bps=16,
                 output_color=rawpy.ColorSpace.sRGB, highlight_mode=rawpy.HighlightMode.Clip,

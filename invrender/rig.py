@@ -114,6 +114,20 @@ class Rig:
         """x of the ball and of the nominal camera, l/4 + delta."""
         return self.screen_size / 4 + self.camera_offset
 
+    def screen_cosines(self, points: Array, cells: int) -> Array:
+        """∫ cos θ cos θ' / d² over each of the screen's ``cells`` × ``cells`` parts, by its middle.
+
+        From ``points`` (..., 3) that face up, below the screen's front; (..., cells, cells), row 0
+        at the pattern's top. Times a pattern's radiance and summed it is the irradiance.
+        """
+        e_x, e_y = self.screen_edges
+        t = (np.arange(cells) + 0.5) / cells
+        middle = self.screen_corner + t[:, None] * e_x + (1 - t)[:, None, None] * e_y
+        down = np.cross(e_y, e_x) / cells**2  # as long as a cell's area
+        d = middle - np.asarray(points)[..., None, None, :]
+        cosines = np.maximum(d[..., 2], 0) * np.maximum(-(d @ down), 0)
+        return np.asarray(cosines / (d * d).sum(-1) ** 2)
+
     @property
     def camera(self) -> Array:
         """Position of the pinhole, (3,)."""

@@ -52,7 +52,12 @@ def find_upright_ball(
         except InputError as error:
             problem = problem or error
             continue
-        (turn, quarter, mirrored), alike, usual = _orientation(here, ball)
+        usual = _likeness(
+            unfold_pattern(here.photo, here.rig, ball, CELLS), resize_pattern(here.pattern, CELLS)
+        )
+        if usual > 1 - BETTER:  # no orientation can be so much more alike
+            return here, ball, _told(first, 0, False)
+        (turn, quarter, mirrored), alike = _orientation(here, ball)
         if alike > ALIKE and alike > usual + BETTER:
             turned, moved = _turned(here, ball, turn)
             assert moved is not None
@@ -61,8 +66,6 @@ def find_upright_ball(
             here = replace(here, photo=turned, rig=rig, pattern=shown)
             ball = replace(moved, confidence=ball.confidence)
             return here, ball, _told((first + turn) % 4, quarter, mirrored)
-        if usual > ALIKE:
-            return here, ball, _told(first, 0, False)
         if first == 0:
             fallback = here, ball, usual
     if fallback is None:
@@ -74,10 +77,10 @@ def find_upright_ball(
     return here, ball, []
 
 
-def _orientation(capture: Capture, ball: Ball) -> tuple[tuple[int, int, bool], float, float]:
+def _orientation(capture: Capture, ball: Ball) -> tuple[tuple[int, int, bool], float]:
     """Quarters of the photo and of the pattern, and whether that is mirrored, by which the ball
-    shows the pattern best; how alike they are then, and as they are."""
-    best, alike, usual = (0, 0, False), -1.0, -1.0
+    shows the pattern best; and how alike they are then."""
+    best, alike = (0, 0, False), -1.0
     pattern = resize_pattern(capture.pattern, CELLS)
     for turn in range(4):
         photo, moved = _turned(capture, ball, turn)
@@ -88,11 +91,9 @@ def _orientation(capture: Capture, ball: Ball) -> tuple[tuple[int, int, bool], f
         for mirrored in (False, True):
             for quarter in range(4):
                 score = _likeness(seen, oriented(pattern, quarter, mirrored))
-                if (turn, quarter, mirrored) == (0, 0, False):
-                    usual = score
                 if score > alike:
                     alike, best = score, (turn, quarter, mirrored)
-    return best, alike, usual
+    return best, alike
 
 
 def _told(turns: int, quarter: int, mirrored: bool) -> list[str]:
