@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, optimize
 
+from invrender.clipped import raise_clipped
 from invrender.errors import InputError
 from invrender.images import Photo, read_image, read_photo
 from invrender.maps import Maps, read_maps
@@ -71,6 +72,7 @@ class Lights:
     ``gamma`` the exponent on the pattern that fits best (1: as it should be; the gain is for 1),
     ``blur`` the camera's in pixels, ``pixels`` the number used, ``saturated`` and
     ``room_saturated`` the shares of screen and room in the ball that are saturated,
+    ``room_raised`` how many times brighter the saturated lamps were made,
     ``pattern_residual`` the residual before the screen's pose and curve were fitted. Where the
     pattern as it should be fits badly, ``pattern`` is as the display really shows it, and ``rig``
     as the screen really hangs; else both are those of the capture.
@@ -302,6 +304,9 @@ def extract_lights(capture: Capture, ball: Ball, height: int = 128) -> Lights:
         raise not_the_pattern(ball)
     fit["room_saturated"] = _room_saturated(photo, rig, ball)
     environment, coverage = unfold_environment(photo, rig, ball, height)
+    environment, fit["room_raised"] = raise_clipped(
+        photo, rig, ball, pattern, gain, environment, coverage
+    )
     environment = fill_environment(environment, coverage)
     captured = unfold_pattern(photo, rig, ball, min(256, max(pattern.shape[:2])))
     return Lights(environment, coverage, pattern, gain, captured, rig, fit)
@@ -326,9 +331,9 @@ def light_warnings(lights: Lights) -> list[str]:
         )
     if fit.get("room_saturated", 0) > 0.001:
         warnings.append(
-            f"{fit['room_saturated']:.1%} of the room is saturated in the ball; lamps are "
-            "brighter than the photo tells, so that the room comes out too dark: expose shorter, "
-            "or take a raw photo"
+            f"{fit['room_saturated']:.1%} of the room is saturated in the ball; it was made "
+            f"{fit.get('room_raised', 1):.1f} times brighter, as the table's shading suggests: "
+            "expose shorter, or take a raw photo, to know"
         )
     if fit.get("pattern_residual", 0) > NO_PATTERN:
         warnings.append(

@@ -38,6 +38,21 @@ def screen_coordinates(rig: Rig, origin: Array, direction: Array) -> tuple[Array
     return s, t, hit
 
 
+def hidden_by_screen(rig: Rig, points: Array, direction: Array) -> Mask:
+    """Whether the screen hides each of the directions (m, 3) from each of the points (n, 3)."""
+    e_x, e_y = rig.screen_edges
+    normal = np.cross(e_x, e_y)
+    from_corner = np.asarray(points) - rig.screen_corner
+
+    def along(axis: Array) -> Array:
+        return np.asarray((from_corner @ axis)[:, None] + t * (direction @ axis)) / (axis @ axis)
+
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = -(from_corner @ normal)[:, None] / (direction @ normal)
+        a, b = along(e_x), along(e_y)
+        return np.asarray((t > 0) & (a >= 0) & (a <= 1) & (b >= 0) & (b <= 1))
+
+
 def trace_ball(rig: Rig, ball: Ball, pixels: Array) -> tuple[Array, Array, Mask]:
     """Points on the ball and mirrored unit directions, both (..., 3), for photo pixels (..., 2).
 
