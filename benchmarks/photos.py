@@ -19,12 +19,14 @@ from PIL import Image
 from scipy import ndimage
 
 from invrender.environments import (
+    directions,
     find_environments,
-    irradiance,
     procedural_environment,
     read_environment,
+    resample_environment,
     rotate_environment,
     scale_environment,
+    solid_angles,
 )
 from invrender.images import Photo, linear_to_srgb, srgb_to_linear
 from invrender.maps import Maps
@@ -32,6 +34,7 @@ from invrender.materials import procedural_material, resize_maps
 from invrender.pattern import default_pattern
 from invrender.render import render
 from invrender.rig import Rig
+from invrender.unfold import hidden_by_screen
 
 Array = NDArray[np.floating[Any]]
 Rng = np.random.Generator
@@ -150,16 +153,18 @@ def incoming(rig: Rig, origin: Array, d: Array, environment: Array, screen: Arra
     return out
 
 
-def table_irradiance(rig: Rig, environment: Array, screen: Array, cells: int = 24) -> Array:
-    """Irradiance (cells, cells, 3) over the table's 0.8 m; what the screen hides has mean light."""
-    room = irradiance(environment)
+def table_irradiance(rig: Rig, environment: Array, screen: Array, cells: int = 48) -> Array:
+    """Irradiance (cells, cells, 3) over the table's 0.8 m: the screen, and the room past it."""
     x = ((np.arange(cells) + 0.5) / cells - 0.5) * 0.8
     p = np.stack(np.broadcast_arrays(x[None, :], -x[:, None], 0.0), -1)
     k = 12
-    part = resize_mean(screen, k)
-    factor = rig.screen_cosines(p, k)
-    light = np.einsum("ijkl,klc->ijc", factor, part)
-    return np.asarray(room * (1 - factor.sum((2, 3)) / np.pi)[..., None] + light)
+    light = np.einsum("ijkl,klc->ijc", rig.screen_cosines(p, k), resize_mean(screen, k))
+    room = resample_environment(environment, 64)[:32].reshape(-1, 3)
+    d = directions(64, 128)[:32].reshape(-1, 3).astype(float)
+    weight = np.repeat(solid_angles(64, 128)[:32], 128) * d[:, 2]
+    for row, points in zip(light, p, strict=True):
+        row += ~hidden_by_screen(rig, points, d) @ (room * weight[:, None])
+    return np.asarray(light)
 
 
 def resize_mean(image: Array, k: int) -> Array:
