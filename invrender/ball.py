@@ -10,25 +10,19 @@ of the image can be predicted, and no coin or printed circle passes that test.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, optimize
 
+from invrender.ball_view import BLURS, TOE, View, curves, view_around
 from invrender.errors import InputError
 from invrender.images import Photo
-from invrender.mirror import (
-    Ball,
-    horizon_points,
-    make_ball,
-    mirror_normals,
-    on_table,
-    outline_points,
-    place_ball,
-)
+from invrender.mirror import Ball, make_ball, mirror_normals, on_table, place_ball
 from invrender.rig import Rig
+from invrender.rim import fit_rim
 
 __all__ = ["Ball", "find_ball", "make_ball", "mirror_normals", "place_ball"]
 
@@ -39,16 +33,8 @@ SEARCH = 3.0  # how many radii from where the rig puts it the ball is looked for
 MIN_CONFIDENCE = 0.5
 MIRROR_WEIGHT = 1.0
 OUTLINE_WEIGHT = 0.5  # of the outline beside the horizon: a mirror pales into the table there
-TOE = 0.1  # added to radiance over its median before the logarithm
-TILT_PRIOR = 0.7  # of the camera, degrees
-RIM_REACH = 2.0  # radii from the ball's centre to which its rim is compared with the table
-LENS = 0.6  # pixels of blur that the camera is taken to have
-CORRELATED, RIM_CORRELATED = 10.0, 20.0  # residuals side by side that tell the same
-HORIZON = 0.5  # pixels; how closely the horizon's edge tells the horizon, at best
-# Level of blur, steps, and the radii tried before them, over the one so far.
-POLISH = ((2, 3, np.linspace(0.94, 1.06, 13)), (1, 3, np.linspace(0.96, 1.04, 9)),
-          (0, 4, np.linspace(0.98, 1.02, 9)))  # fmt: skip
-BLURS = (0.7, 1.4, 2.8, 5.6, 11.2)  # of the levels, in the view's pixels
+UNSURE = 0.0028  # deviation of the radius that halves the confidence
+FINE = 64  # pixels; the ball's radius in the view of the last fit
 
 
 def find_ball(photo: Photo, rig: Rig, manual: tuple[float, float, float] | None = None) -> Ball:
@@ -71,7 +57,7 @@ def find_ball(photo: Photo, rig: Rig, manual: tuple[float, float, float] | None 
             "read: take a larger photo or check rig.toml"
         )
     middle = np.asarray(expected.centre)
-    view = _view(photo, middle, (SEARCH + 1.5) * expected.radius, expected.radius / 48)
+    view = view_around(photo, middle, (SEARCH + 1.5) * expected.radius, expected.radius / 48)
     starts = []
     for start in _coarse(view, rig, expected):
         theta = _climb(view, rig, start, 2, 0.08, 25)
@@ -86,10 +72,10 @@ def find_ball(photo: Photo, rig: Rig, manual: tuple[float, float, float] | None 
     if best == -math.inf:
         raise InputError("no mirror ball found: the photo shows nothing where the rig puts it")
     found = make_ball(rig, np.array([theta[0], theta[1], 0.0]), theta[2], size)
-    confidence = _confidence(view, rig, theta)
-    fine = _view(photo, np.asarray(found.centre), 2.4 * found.radius, found.radius / 160)
-    theta, tilted = _polish(fine, rig, theta)
-    seen = make_ball(tilted, np.array([theta[0], theta[1], 0.0]), theta[2], size, confidence)
+    fine = view_around(photo, np.asarray(found.centre), 3.3 * found.radius, found.radius / FINE)
+    rim = fit_rim(fine, rig, theta)
+    confidence = _confidence(view, rim.rig, rim.theta) / (1 + (rim.deviation / UNSURE) ** 2)
+    seen = make_ball(rim.rig, np.array([*rim.theta[:2], 0.0]), rim.theta[2], size)
     ball = replace(place_ball(rig, size, *seen.centre, seen.radius), confidence=confidence)
     (x, y), r = ball.centre, ball.radius
     if confidence < MIN_CONFIDENCE:
@@ -117,67 +103,7 @@ def _check_exposure(photo: Photo, ball: Ball) -> None:
         raise InputError("the mirror ball is black in the photo: expose it longer")
 
 
-@dataclass(frozen=True)
-class _View:
-    """A part of the photo, shrunk ``step`` times, ready to be compared with curves.
-
-    ``tensor`` (h, w, 3): xx, xy, yy of the image's structure tensor summed over the channels,
-    ``noise`` its usual trace; ``levels`` (5, h, w, 3) the linear image over its
-    median, ever more blurred. Photo pixel p is view position (p - origin) / step.
-    """
-
-    origin: Array
-    step: int
-    size: tuple[int, int]
-    tone: Array
-    levels: Array
-    tensor: Array
-    noise: float
-
-    def at(self, points: Array, rig: Rig) -> Array:
-        """Points in space to view positions (..., 2), x right, y down."""
-        return (rig.project(points, *self.size) - self.origin) / self.step
-
-
-def _view(photo: Photo, middle: Array, reach: float, shrink: float, sigma: float = 1.2) -> _View:
-    step = max(1, round(shrink))
-    low = np.maximum(np.floor(middle - reach), 0).astype(int)
-    high = np.minimum(np.ceil(middle + reach), [photo.width, photo.height]).astype(int)
-    count = np.maximum((high - low) // step, 1)
-    high = low + count * step
-    part = photo.image[low[1] : high[1], low[0] : high[0]]
-    part = part.reshape(count[1], step, count[0], step, 3).mean((1, 3))
-    level = max(float(np.median(part)), 1e-6 * float(part.max()), 1e-12)
-    part = np.minimum(part / level, 20.0)
-    tone = np.log(part + TOE)
-    levels = np.stack(
-        [ndimage.gaussian_filter(part, (a, a, 0), mode="nearest") for a in BLURS]
-    ).astype(np.float32)
-    smooth = ndimage.gaussian_filter(tone, (sigma, sigma, 0), mode="nearest")
-    gy, gx = (ndimage.correlate1d(smooth, [-0.5, 0, 0.5], axis=a, mode="nearest") for a in (0, 1))
-    tensor = np.stack([(gx * gx).sum(-1), (gx * gy).sum(-1), (gy * gy).sum(-1)], -1)
-    noise = float(np.median(tensor[..., 0] + tensor[..., 2])) + 1e-7
-    size = (photo.height, photo.width)
-    return _View(low.astype(float), step, size, tone, levels, tensor.astype(np.float32), noise)
-
-
-def _curves(view: _View, rig: Rig, theta: Array, count: int) -> tuple[Array, Array, Array, Array]:
-    """Horizon and outline in the view, each with its outward unit normals: (n, 2) four times."""
-    position = np.array([theta[0], theta[1], 0.0])
-    horizon = view.at(horizon_points(rig, position, theta[2], count), rig)
-    outline = view.at(outline_points(rig, position, theta[2], count), rig)
-    return horizon, _normals(horizon), outline, _normals(outline)
-
-
-def _normals(curve: Array) -> Array:
-    along = np.roll(curve, -1, 0) - np.roll(curve, 1, 0)
-    normal = np.stack([along[:, 1], -along[:, 0]], -1)
-    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
-    outward = np.sum(normal * (curve - curve.mean(0)), -1, keepdims=True)
-    return np.asarray(normal * np.where(outward < 0, -1, 1))
-
-
-def _alignment(view: _View, curve: Array, normal: Array) -> Array:
+def _alignment(view: View, curve: Array, normal: Array) -> Array:
     """How much of an edge runs along a curve at each of its points, (n,) in [0, 1].
 
     The share of the structure tensor across the curve, with the usual trace added below so that
@@ -193,10 +119,10 @@ def _alignment(view: _View, curve: Array, normal: Array) -> Array:
 
 
 def _score(
-    view: _View, rig: Rig, theta: Array, count: int = 96, blur: int = 0
+    view: View, rig: Rig, theta: Array, count: int = 96, blur: int = 0
 ) -> tuple[float, float, float, float]:
     """Weighted sum of: the horizon's and the outline's share of edge, the mirrored table's fit."""
-    horizon, hn, outline, on = _curves(view, rig, theta, count)
+    horizon, hn, outline, on = curves(view, rig, theta, count)
     h = float(_alignment(view, horizon, hn).mean())
     o = float(_alignment(view, outline, on).mean())
     m = _mirrored(view, rig, theta, blur)
@@ -223,7 +149,7 @@ def _ring() -> tuple[Array, Array]:
     return normal.reshape(-1, 3), np.repeat(np.round(level).astype(int), 72)
 
 
-def _mirrored(view: _View, rig: Rig, theta: Array, blur: int = 0) -> float:
+def _mirrored(view: View, rig: Rig, theta: Array, blur: int = 0) -> float:
     """How well the ball's rim shows the table around it, as the same photo shows that, in [0, 1].
 
     1 - mean of a truncated square of the difference in log radiance; 0.5 if the photo shows nothing
@@ -237,7 +163,7 @@ def _mirrored(view: _View, rig: Rig, theta: Array, blur: int = 0) -> float:
 
 
 def _mirror_difference(
-    view: _View, rig: Rig, theta: Array, blur: int = 0
+    view: View, rig: Rig, theta: Array, blur: int = 0
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Differences (n, 3) in log radiance between the ball's rim and the table it mirrors.
 
@@ -279,7 +205,7 @@ def _look(levels: Array, level: Array, at: Array) -> Array:
     return np.asarray(top * (1 - fy) + bottom * fy)
 
 
-def _coarse(view: _View, rig: Rig, expected: Ball, keep: int = 8) -> list[Array]:
+def _coarse(view: View, rig: Rig, expected: Ball, keep: int = 8) -> list[Array]:
     """The best few (x, y, radius) on the table, by scoring every pixel of the view."""
     trace = view.tensor[..., 0] + view.tensor[..., 2] + 3 * view.noise
     # Every second pixel will do: the curves of a ball of 48 pixels are that blurred anyway.
@@ -294,7 +220,7 @@ def _coarse(view: _View, rig: Rig, expected: Ball, keep: int = 8) -> list[Array]
     xx, xy, yy = (np.pad(a, margin) for a in (xx, xy, yy))
     for scale in np.linspace(1 - RADIUS_PRIOR, 1 + RADIUS_PRIOR, 6):
         theta = np.array([centre[0], centre[1], expected.radius_m * scale])
-        hc, hn, oc, on = _curves(view, rig, theta, 48)
+        hc, hn, oc, on = curves(view, rig, theta, 48)
         total = np.zeros((h, w), np.float32)
         for curve, normal, weight in ((hc, hn, 1.0), (oc, on, OUTLINE_WEIGHT)):
             shifts = np.round((curve - middle) / 2).astype(int) + margin
@@ -324,7 +250,7 @@ def _coarse(view: _View, rig: Rig, expected: Ball, keep: int = 8) -> list[Array]
     return chosen
 
 
-def _climb(view: _View, rig: Rig, start: Array, blur: int, reach: float, evaluations: int) -> Array:
+def _climb(view: View, rig: Rig, start: Array, blur: int, reach: float, evaluations: int) -> Array:
     """Move (x, y, radius) to a better score nearby (Nelder–Mead), ``reach`` in radii at first."""
     unit = rig.ball_radius * reach
 
@@ -341,151 +267,7 @@ def _climb(view: _View, rig: Rig, start: Array, blur: int, reach: float, evaluat
     return np.asarray(start + result.x * unit)
 
 
-def _polish(view: _View, rig: Rig, theta: Array, reach: float = 0.05) -> tuple[Array, Rig]:
-    """Sub-pixel (x, y, radius) by robust least squares, Gauss–Newton, and the rig they hold in.
-
-    Residuals are the differences between the rim and the table that it mirrors, and the distances
-    from the horizon to the strongest edge within ``reach`` radii; the outline itself is no edge in
-    a contact shadow. Each kind is scaled by its own spread and weighted as by a Cauchy
-    distribution. Three levels of blur, coarse to fine; at each the radius is searched first, since
-    a contact shadow, a valley with the outline at its floor, has no slope that leads there. The
-    camera's tilt is fitted as well, within `TILT_PRIOR`: by a degree it moves the horizon against
-    the outline by a hundredth of the radius.
-    """
-
-    def tilted(p: Array) -> Rig:
-        return replace(rig, camera_tilt=tuple(np.add(rig.camera_tilt, [p[3], p[4], 0])))
-
-    radius = float(
-        np.linalg.norm(np.diff(_curves(view, rig, theta, 2)[2], axis=0)) / 2
-    )  # in the view's pixels
-    unit = np.array([*np.full(3, theta[2] * 2e-3), 0.1, 0.1])
-    aim = rig.camera[2] * math.radians(1)  # a tilt moves the image: x and y follow it
-    follow = np.eye(5)
-    follow[3, 1], follow[4, 0] = aim, -aim
-    p = np.array([*theta, 0.0, 0.0])
-    turn = 0
-    for blur, turns, scales in POLISH:
-        rim = _rim(math.hypot(BLURS[blur], LENS) / radius)
-        here = tilted(p)
-        tries = [p[:3] * [1, 1, k] for k in scales]
-        p[:3] = tries[int(np.argmin([_rim_cost(view, here, q, rim, blur) for q in tries]))]
-        for _ in range(turns):
-            here = tilted(p)
-            steps = unit[:, None] * follow
-            moves = [(tilted(p + d), (p + d)[:3]) for d in steps]
-            base, valid = _rim_difference(view, here, p[:3], rim, blur)
-            slope = np.stack(
-                [_rim_difference(view, r, q, rim, blur)[0] - base for r, q in moves], -1
-            )
-            offset = float(np.clip(np.median(base[valid]), -0.3, 0.3)) if valid.any() else 0.0
-            horizon, normal = _curves(view, here, p[:3], 240)[:2]
-            edge, strength = _edges(view, horizon, normal, max(2.0, reach * radius * 0.8**turn))
-            shifted = [_curves(view, r, q, 240)[0] - horizon for r, q in moves]
-            along = np.stack([np.sum(m * normal, -1) for m in shifted], -1)
-            prior = (unit[3] / TILT_PRIOR) ** 2
-            matrix = np.diag([1e-9, 1e-9, 1e-9, prior, prior])
-            right = -prior * np.array([0, 0, 0, p[3], p[4]]) / unit[3]
-            for r, columns, weight, floor, correlated in (
-                (base - offset, slope, valid * 1.0, 0.01, RIM_CORRELATED),
-                (-edge, along, strength, HORIZON, CORRELATED),
-            ):
-                if weight.sum() < 20:
-                    continue
-                spread = max(floor, 1.48 * float(np.median(np.abs(r[weight > 0.1]))))
-                k2 = weight / (1 + (r / spread) ** 2) / spread**2 / correlated
-                matrix = matrix + columns.T @ (columns * k2[:, None])
-                right = right - columns.T @ (k2 * r)
-            damped = matrix + np.diag(np.diag(matrix)) * 1e-3
-            p = p + np.clip(np.linalg.solve(damped, right), -10, 10) @ steps
-            turn += 1
-    return p[:3], tilted(p)
-
-
-def _rim(sigma: float) -> tuple[Array, Array, Array]:
-    """Normals (16, 72, 3) of the rim that mirrors the table near it, (16, 72, 7, 3) of what a
-    blur of ``sigma`` radii mixes into each of them radially, and its weights (7,).
-
-    Radially the mirror shrinks the table up to twenty times, along the rim hardly.
-    """
-    sine = np.linspace(0.78, 0.992, 16)
-    k = np.linspace(-2, 2, 7)
-    weight = np.exp(-k * k / 2)
-    psi = np.arange(72) * (2 * np.pi / 72)
-
-    def normals(s: Array) -> Array:
-        return np.stack(
-            np.broadcast_arrays(
-                s * np.cos(psi)[:, None], s * np.sin(psi)[:, None], np.sqrt(1 - s * s)
-            ),
-            -1,
-        )
-
-    mixed = np.clip(sine[:, None, None] + k * sigma, 0.72, 0.9995)
-    return normals(sine[:, None, None])[:, :, 0], normals(mixed), weight / weight.sum()
-
-
-def _rim_difference(
-    view: _View, rig: Rig, theta: Array, rim: tuple[Array, Array, Array], blur: int
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Differences (n,) in log radiance between the rim and the table it mirrors, each channel.
-
-    As `_mirror_difference`, but averaged along the way in which the mirror shrinks the table, not
-    over a disc, which would mix the ball itself into the table beside it.
-    """
-    normal, mixed, weight = rim
-    position = np.array([theta[0], theta[1], 0.0])
-    _, rise, at = _mirrored_table(rig, theta, mixed)
-    table = view.at(at, rig)
-    h, w = view.tone.shape[:2]
-    distance = np.linalg.norm(at - position, axis=-1) / theta[2]
-    shown = (rise < -0.03) & (table > 0).all(-1) & (table < [w, h]).all(-1)
-    share = (shown & (distance > 1.005) & (distance < RIM_REACH)) * weight
-    valid = share.sum(-1) > 0.8
-    share = share / np.maximum(share.sum(-1, keepdims=True), 1e-9)
-    table = np.where(share[..., None] > 0, table, 0).reshape(-1, 2)
-    expected = _look(view.levels, np.full(len(table), blur), table).reshape(*share.shape, 3)
-    expected = (expected * share[..., None]).sum(-2) * np.asarray(rig.ball_reflectance)
-    place = view.at(position + theta[2] * normal, rig).reshape(-1, 2)
-    seen = _look(view.levels, np.full(len(place), blur), place).reshape(expected.shape)
-    difference = np.log(seen + TOE) - np.log(expected + TOE)
-    return difference.reshape(-1), np.repeat(valid.reshape(-1), 3)
-
-
-def _rim_cost(
-    view: _View, rig: Rig, theta: Array, rim: tuple[Array, Array, Array], blur: int
-) -> float:
-    """Mean log(1 + square) of the rim's differences, without what they share."""
-    difference, valid = _rim_difference(view, rig, theta, rim, blur)
-    if valid.mean() < 0.15:
-        return math.inf
-    r = difference[valid]
-    r = r - np.clip(np.median(r), -0.3, 0.3)
-    return float(np.log1p((r / 0.03) ** 2).mean())
-
-
-def _edges(view: _View, curve: Array, normal: Array, reach: float) -> tuple[Array, Array]:
-    """Signed distance (n,) along each normal to the strongest edge, and its weight in [0, 1]."""
-    t = np.arange(-math.ceil(reach * 4) - 8, math.ceil(reach * 4) + 9) / 4
-    at = curve[:, None] + t[None, :, None] * normal[:, None]
-    at = np.stack([at[..., 1] - 0.5, at[..., 0] - 0.5])
-    slope = np.zeros(at.shape[1:])
-    for c in range(3):
-        line = ndimage.map_coordinates(view.tone[..., c], at, order=1, mode="nearest")
-        slope += ndimage.gaussian_filter1d(line, 3.0, axis=1, order=1, mode="nearest") ** 2
-    i = np.argmax(slope[:, 8:-8], 1) + 8
-    row = np.arange(len(curve))
-    a, b, c2 = (np.sqrt(slope[row, i + k]) for k in (-1, 0, 1))
-    bend = a - 2 * b + c2
-    with np.errstate(divide="ignore", invalid="ignore"):
-        shift = np.where(bend < 0, 0.5 * (a - c2) / bend, 0)
-    interior = (i > 8) & (i < len(t) - 9)
-    usual = np.median(slope) + 1e-8
-    strength = np.clip(b**2 / (30 * usual) - 0.5, 0, 1)
-    return t[i] + np.clip(shift, -0.5, 0.5) / 4, strength * interior
-
-
-def _features(view: _View, rig: Rig, theta: Array) -> Array:
+def _features(view: View, rig: Rig, theta: Array) -> Array:
     """Six numbers (6,) that tell a ball from other round things.
 
     The shares of edge along horizon and outline; the mirrored table's fit; the offset of that fit
@@ -501,7 +283,7 @@ def _features(view: _View, rig: Rig, theta: Array) -> Array:
     return np.array([h, o, m, abs(offset), o - beyond, m - wrong])
 
 
-def _confidence(view: _View, rig: Rig, theta: Array) -> float:
+def _confidence(view: View, rig: Rig, theta: Array) -> float:
     """Probability in [0, 1] that a ball stands at ``theta``: logistic in `_features`.
 
     The weights were fitted to simulated photos with and without a ball.

@@ -1,0 +1,334 @@
+"""The ball to some hundredths of a pixel: its rim against the table that it mirrors.
+
+The hemisphere's centre lies on the table. So a plane through the camera and that centre holds the
+whole way of its rays: the photo shows it as one line, what the ball mirrors stays in it, and it
+cuts the table in a line through the centre. On each such line the table outside the ball and its
+image inside are one unknown function of the distance from the centre. Near the ball it is solved
+for by linear least squares, at every step anew (variable projection: Golub and Pereyra 1973, with
+Kaufman's derivative, 1975); farther out the photo shows it. The ball is where the rest is least:
+at its outline the radiance drops by the mirror's reflectance, and inside it runs backwards.
+
+The camera's tilt moves the horizon's image by a hundredth of the radius a degree and the outline
+not at all, so that the two together tell it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from invrender.ball_view import View, curves, edges
+from invrender.rig import Rig
+
+Array = NDArray[np.floating[Any]]
+Mask = NDArray[np.bool_]
+FINE = 3  # points of a line to each of the view's pixels
+SPACING = 0.014  # of the unknown table's nodes, in radii
+SMOOTH = 3e-3  # weight of their second differences
+NEAREST, FARTHEST = 0.80, 3.0  # radii where the lines begin, and to which the table is looked up
+# Lines, blur in the view's pixels, radii to which the table is unknown, steps, radii to start from.
+STAGES = (
+    (48, 2.0, 1.08, 4, (0.95, 0.975, 1.0, 1.025, 1.05)),
+    (64, 1.0, 1.15, 6, (1.0,)),
+    (144, 0.0, 1.25, 10, (1.0,)),
+)
+LUMA = (0.2126, 0.7152, 0.0722)  # a JPEG has its colours at half the resolution
+# The unknowns: x, y, radius in metres; the camera's tilt in degrees about x and y; the logarithms
+# of its blur in the view's pixels and of the mirror's reflectance over the rig's.
+_TILT, _BLUR, _MIRROR = slice(3, 5), 5, 6
+TILT_PRIOR, BLUR_PRIOR, MIRROR_PRIOR = 1.5, 0.15, 0.01
+USUAL_BLUR = 0.8
+ROBUST = 1.5  # spreads from which a residual counts less
+FAITH = 0.004  # of the radiance: the least spread
+HORIZON = 0.5  # of a pixel: the least spread of the horizon's edge
+CORRELATED, EDGES_CORRELATED = 6.0, 5.0  # residuals side by side that tell the same
+
+
+@dataclass(frozen=True)
+class Rim:
+    """``theta``: x, y, radius in metres in ``rig``, whose camera is tilted as fitted.
+
+    ``deviation``: what the fit expects of the radius, relative (a standard deviation).
+    """
+
+    theta: Array
+    rig: Rig
+    deviation: float
+
+
+def fit_rim(view: View, rig: Rig, theta: Array) -> Rim:
+    """The ball near ``theta``: x, y, radius in metres, some hundredths of the radius off.
+
+    ``view``: the photo out to about three radii, the ball some 60 pixels in radius. Levenberg's and
+    Marquardt's steps, coarse to fine, with Cauchy's weights on the lines' residuals and on the
+    distances from the horizon to the strongest edges near it.
+    """
+    p = np.array([*theta, 0.0, 0.0, math.log(USUAL_BLUR), 0.0])
+    for count, blur, limit, turns, scales in STAGES:
+        lines = _Lines(view, rig, p, count, blur, limit)
+        starts = [p * [1, 1, k, 1, 1, 1, 1] for k in scales]
+        spread, edge = np.min([lines.spreads(q) for q in starts], axis=0)
+        found = [lines.descend(q, turns, spread, edge) for q in starts]
+        _, p, information = min(found, key=lambda f: f[0])
+    spread = math.sqrt(np.linalg.inv(information)[2, 2])
+    return Rim(p[:3], _tilted(rig, p), spread * float(lines.units[2, 2] / p[2]))
+
+
+def _tilted(rig: Rig, p: Array) -> Rig:
+    return replace(rig, camera_tilt=tuple(np.add(rig.camera_tilt, [*p[_TILT], 0])))
+
+
+@dataclass(frozen=True)
+class _Trace:
+    """What the points of the lines see, (lines, points).
+
+    ``mirrored`` and ``direct``: where they see the table, in radii from the ball's centre, by the
+    mirror and past it; ``inside``: their share of the ball; ``far``: the table's radiance where it
+    is mirrored from beyond the unknown part; ``hidden``: where the photo does not show that.
+    ``seen``: (lines, samples), the photo along the lines.
+    """
+
+    mirrored: Array
+    direct: Array
+    inside: Array
+    far: Array
+    hidden: Mask
+    seen: Array
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """A state of the fit: ``cost``, relative ``error`` and its robust ``weight`` (lines, samples),
+    and the ``trace`` that it was made from.
+
+    ``table``: (lines, nodes); ``matrix`` (lines, samples, nodes) and ``solver``, its weighted
+    pseudo-inverse; ``scale``: (lines, 1), the radiance that errors are relative to.
+    """
+
+    cost: float
+    error: Array
+    weight: Array
+    trace: _Trace
+    table: Array
+    matrix: Array
+    solver: Array
+    scale: Array
+
+
+class _Lines:
+    """The lines of one stage, from ``NEAREST`` radii to where the table is known."""
+
+    def __init__(
+        self, view: View, rig: Rig, p: Array, count: int, blur: float, limit: float
+    ) -> None:
+        self.view, self.rig, self.blur, self.limit = view, rig, blur, limit
+        light = view.image @ np.array(LUMA)
+        self.light = ndimage.gaussian_filter(light, blur) if blur else light
+        self.farther = ndimage.gaussian_filter(light, blur + 1)
+        outline = curves(view, _tilted(rig, p), p, 2)[2]
+        self.radius = float(np.linalg.norm(outline[1] - outline[0])) / 2
+        angle = np.arange(count) * (2 * math.pi / count)
+        self.along = np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], -1)
+        low, high = NEAREST * self.radius, limit * self.radius - 1
+        self.samples = np.arange(math.ceil(low), math.floor(high) + 1.0)
+        self.points = np.arange(low - 4 + 0.5 / FINE, high + 4, 1 / FINE)
+        self.nodes = max(4, round(1 + (limit - 1) / (SPACING * (1 + blur))))
+        bend = np.diff(np.eye(self.nodes), 2, axis=0)
+        self.smooth = SMOOTH * bend.T @ bend + 1e-6 * np.eye(self.nodes)
+        self.mirror = float(np.asarray(rig.ball_reflectance) @ LUMA)
+        # Steps of the unknowns. A tilt moves the whole image: the ball goes along with it.
+        self.units = np.diag([*np.full(3, p[2] * 2e-3), 0.1, 0.1, 0.05, 0.01])
+        aim = 0.1 * rig.camera[2] * math.radians(1)
+        self.units[3, 1], self.units[4, 0] = aim, -aim
+        deviation = [TILT_PRIOR, TILT_PRIOR, BLUR_PRIOR, MIRROR_PRIOR]
+        self.prior = np.array([*np.full(3, 1e-9), *(1 / np.square(deviation))])
+        self.usual = np.array([0, 0, 0, 0, 0, math.log(USUAL_BLUR), 0])
+
+    def trace(self, p: Array) -> _Trace:
+        """Rays in the planes of the lines: x along the table, from the ball's centre; y up."""
+        rig, view, radius = _tilted(self.rig, p), self.view, p[2]
+        centre = np.array([p[0], p[1], 0.0])
+        to_camera = rig.camera - centre
+        camera_x = self.along @ to_camera
+        up = to_camera - camera_x[:, None] * self.along
+        camera_y = np.sqrt((up * up).sum(-1))
+        up /= camera_y[:, None]
+        # A view's position is linear in the ray (x, y, -1) of the camera.
+        middle = view.at(centre, rig)
+        line = view.at(centre + 1.3 * radius * self.along, rig) - middle
+        line /= np.sqrt((line * line).sum(-1))[:, None]
+        focal = rig.focal(view.size[1]) / view.step
+        start = -to_camera / (to_camera @ rig.camera_axes[2])
+        turn = (line * [1 / focal, -1 / focal]) @ rig.camera_axes[:2]
+        ray_x = (self.along @ start)[:, None] + (turn * self.along).sum(-1)[:, None] * self.points
+        ray_y = (up @ start)[:, None] + (turn * up).sum(-1)[:, None] * self.points
+        length = np.sqrt(ray_x * ray_x + ray_y * ray_y)
+        ray_x, ray_y = ray_x / length, ray_y / length
+        camera_x, camera_y = camera_x[:, None], camera_y[:, None]
+        direct = np.abs(camera_x - ray_x * (camera_y / ray_y)) / radius
+        along = -(camera_x * ray_x + camera_y * ray_y)
+        offset = camera_x**2 + camera_y**2 - radius * radius
+        distance = along - np.sqrt(np.maximum(along * along - offset, 0))
+        x, y = camera_x + distance * ray_x, camera_y + distance * ray_y
+        turned = 2 * (ray_x * x + ray_y * y) / radius**2
+        back_x, back_y = ray_x - turned * x, ray_y - turned * y
+        mirrored = np.abs(x - back_x * (y / np.minimum(back_y, -1e-3))) / radius
+        mirrored = np.where(back_y < -0.03, mirrored, np.inf)
+        # The outline: where a ray touches the circle, or the rim on the table, if it is seen.
+        touch = np.arctan2(camera_y, camera_x) - np.arccos(radius / np.hypot(camera_x, camera_y))
+        touch = np.maximum(touch, 0)
+        edge = np.cos(touch) * self.along + np.sin(touch) * up
+        outline = view.at(centre + radius * edge, rig) - middle
+        outline = np.sqrt((outline * outline).sum(-1))[:, None]
+        inside = np.clip((outline - self.points) * FINE + 0.5, 0, 1)
+
+        seen = _look(self.light, middle + self.samples[:, None] * line[:, None])
+        beyond = (mirrored > self.limit) & (inside > 0)
+        far, hidden = np.zeros(beyond.shape), np.zeros(beyond.shape, bool)
+        reach = np.minimum(mirrored[beyond], FARTHEST) * radius
+        place = view.at(centre + reach[:, None] * self.along[np.nonzero(beyond)[0]], rig)
+        shown = (place > 0).all(-1) & (place < self.light.shape[::-1]).all(-1)
+        hidden[beyond] = ~shown | (mirrored[beyond] > FARTHEST)
+        far[beyond] = _look(self.farther, place)
+        return _Trace(mirrored, direct, inside, far, hidden, seen)
+
+    def kernel(self, p: Array) -> Array:
+        """Weights (samples, points) of the camera's blur along a line."""
+        sigma = math.hypot(math.exp(p[_BLUR]), self.blur)
+        weight = np.exp(-0.5 * ((self.samples[:, None] - self.points) / sigma) ** 2)
+        return np.asarray(weight / weight.sum(1, keepdims=True))
+
+    def node(self, distance: Array) -> Array:
+        """Where the unknown table has a distance from the centre, in nodes."""
+        last = self.nodes - 1
+        return np.clip((distance - 1) * (last / (self.limit - 0.98)), 0, last - 1e-3)
+
+    def solve(self, p: Array, spread: float, edge: float, weight: Array | None) -> _Fit:
+        """The table that fits best with the ball at ``p``, and how well; ``spread`` and ``edge``:
+        of the lines' residuals and of the horizon's, ``weight``: the samples' for the table."""
+        t, kernel = self.trace(p), self.kernel(p)
+        mirror = self.mirror * math.exp(p[_MIRROR])
+        known = t.inside * (t.mirrored > self.limit)
+        valid = (known * t.hidden) @ kernel.T < 0.02
+        near = (t.inside - known) * mirror
+        index = np.arange(self.nodes)
+        hats = np.maximum(0, 1 - np.abs(self.node(t.mirrored)[..., None] - index)) * near[..., None]
+        hats += (
+            np.maximum(0, 1 - np.abs(self.node(t.direct)[..., None] - index))
+            * (1 - t.inside)[..., None]
+        )
+        matrix = kernel @ hats
+        right = t.seen - (known * t.far * mirror) @ kernel.T
+        weight = valid * (1.0 if weight is None else weight)
+        weighted = (matrix * weight[..., None]).transpose(0, 2, 1)
+        solver = np.linalg.solve(weighted @ matrix + self.smooth, weighted)
+        table = (solver @ right[..., None])[..., 0]
+        scale = np.median(t.seen, 1, keepdims=True) + 1e-3 * t.seen.mean()
+        error = (right - (matrix @ table[..., None])[..., 0]) / scale
+        relative = (error / (ROBUST * spread)) ** 2
+        # A sample that the photo leaves open costs what a usual one does.
+        cost = float(np.log1p(np.where(valid, relative, 0.25)).sum()) * ROBUST**2 / CORRELATED
+        *_, off, strength = self.horizon(p)
+        cost += float((strength * np.log1p((off / edge) ** 2)).sum()) / EDGES_CORRELATED
+        cost += float(self.prior @ (self.off(p) ** 2))
+        return _Fit(cost, error, valid / (1 + relative), t, table, matrix, solver, scale)
+
+    def residual(self, p: Array, t: _Trace, table: Array) -> Array:
+        """The photo along the lines less what it should be with the ball at ``p`` on ``table``."""
+        row = np.arange(len(table))[:, None]
+
+        def look(distance: Array) -> Array:
+            q = self.node(distance)
+            i = q.astype(int)
+            return np.asarray(table[row, i] + (table[row, i + 1] - table[row, i]) * (q - i))
+
+        inside = np.where(t.mirrored > self.limit, t.far, look(t.mirrored))
+        light = t.inside * self.mirror * math.exp(p[_MIRROR]) * inside
+        light += (1 - t.inside) * look(t.direct)
+        return np.asarray(t.seen - light @ self.kernel(p).T)
+
+    def off(self, p: Array) -> Array:
+        """How far the unknowns are from what the prior expects; nought for the ball itself."""
+        return (p - self.usual) * (np.arange(len(p)) >= 3)
+
+    def horizon(self, p: Array) -> tuple[Array, Array, Array, Array]:
+        """The horizon (n, 2), its normals, the signed distance to its edge, and that's weight."""
+        curve, normal = curves(self.view, _tilted(self.rig, p), p, 120)[:2]
+        reach = max(2.0, 0.05 * self.radius * 0.5 ** (3 - self.blur))
+        return curve, normal, *edges(self.view, curve, normal, reach)
+
+    def spreads(self, p: Array) -> tuple[float, float]:
+        """The usual residual of the lines with the ball at ``p``, and of the horizon's edge."""
+        fit = self.solve(p, 1.0, 1.0, None)
+        rest = np.abs(fit.error[fit.weight > 0])
+        off, strength = self.horizon(p)[2:]
+        strong = np.abs(off[strength > 0.1])
+        edge = float(np.median(strong)) if strong.size else 0.0
+        spread = float(np.median(rest)) if rest.size else 1.0
+        return max(FAITH, 1.48 * spread), max(HORIZON, 1.48 * edge)
+
+    def descend(
+        self, p: Array, turns: int, spread: float, edge: float
+    ) -> tuple[float, Array, Array]:
+        """Steps from ``p`` on: the cost, the unknowns, their information in `units`."""
+        start = self.solve(p, spread, edge, None)
+        fit = self.solve(p, spread, edge, start.weight)
+        damping = 1e-3
+        information, gradient = self.normal_equations(p, fit, spread, edge)
+        for _ in range(turns):
+            for _ in range(4):
+                damped = information + np.diag(np.diag(information)) * damping
+                step = -np.linalg.solve(damped, gradient)
+                step *= min(1, 8 / np.abs(step).max())
+                tried = self.solve(p + step @ self.units, spread, edge, fit.weight)
+                if tried.cost < fit.cost:
+                    break
+                damping *= 8
+            else:
+                break
+            gained = fit.cost - tried.cost
+            p, fit, damping = p + step @ self.units, tried, max(damping / 5, 1e-4)
+            information, gradient = self.normal_equations(p, fit, spread, edge)
+            if gained < 0.05:
+                break
+        return fit.cost, p, information
+
+    def normal_equations(
+        self, p: Array, fit: _Fit, spread: float, edge: float
+    ) -> tuple[Array, Array]:
+        """Gauss–Newton's matrix (7, 7) and the gradient (7,), in `units`."""
+        base = self.residual(p, fit.trace, fit.table)
+        columns = []
+        for k, unit in enumerate(self.units):
+            # Blur and reflectance move no ray.
+            trace = self.trace(p + unit) if k < _BLUR else fit.trace
+            column = self.residual(p + unit, trace, fit.table) - base
+            column -= (fit.matrix @ (fit.solver @ column[..., None]))[..., 0]
+            columns.append((column / fit.scale).reshape(-1))
+        slope = np.stack(columns)
+        weighted = slope * (fit.weight.reshape(-1) / spread**2 / CORRELATED)
+        matrix = self.units @ np.diag(self.prior) @ self.units.T + weighted @ slope.T
+        gradient = self.units @ (self.prior * self.off(p)) + weighted @ fit.error.reshape(-1)
+        curve, normal, off, strength = self.horizon(p)
+        slope = np.zeros((len(p), len(curve)))
+        for k, unit in enumerate(self.units[:5]):
+            moved = curves(self.view, _tilted(self.rig, p + unit), p + unit, len(curve))[0]
+            slope[k] = np.sum((moved - curve) * normal, -1)
+        weighted = slope * (strength / (1 + (off / edge) ** 2) / edge**2 / EDGES_CORRELATED)
+        return matrix + weighted @ slope.T, gradient - weighted @ off
+
+
+def _look(image: Array, at: Array) -> Array:
+    """Bilinear look-ups in an image (h, w) at positions (..., 2), the border repeated."""
+    h, w = image.shape
+    x, y = np.clip(at[..., 0] - 0.5, 0, w - 1.001), np.clip(at[..., 1] - 0.5, 0, h - 1.001)
+    i, j = y.astype(int), x.astype(int)
+    fy, fx, k, flat = y - i, x - j, i * w + j, image.reshape(-1)
+    top = flat[k] * (1 - fx) + flat[k + 1] * fx
+    bottom = flat[k + w] * (1 - fx) + flat[k + w + 1] * fx
+    return np.asarray(top * (1 - fy) + bottom * fy)
