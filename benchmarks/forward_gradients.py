@@ -13,31 +13,28 @@ from scenes import MAPS, RIG, Array, Case, averaged, curve
 from invrender import photograph, render
 from invrender.backend import Float, dr, vector
 from invrender.photograph import mi
+from invrender.rig import Rig
 from invrender.scene import make_view
 
 
-def sample_sensor(n: int) -> mi.Sensor:
-    """The camera with one pixel a texel of the sample, n × n; of the nominal rig."""
-    size = RIG.screen_size
-    half = 0.625 * size
+def sample_sensor(n: int, rig: Rig = RIG) -> mi.Sensor:
+    """The rig's camera, cropped to the sample, with one pixel a texel of it, n × n."""
+    size = rig.screen_size
     return mi.load_dict(
         {
             "type": "perspective",
-            "fov": float(np.degrees(2 * np.arctan(half / RIG.screen_height))),
+            "fov": float(np.degrees(2 * np.arctan(rig.sample_size / 2 / rig.screen_height))),
             "fov_axis": "x",
+            "principal_point_offset_x": -rig.optical_axis_x / rig.sample_size,
             "near_clip": 1e-3 * size,
             "far_clip": 1e3 * size,
             "to_world": photograph._transform(
-                [-RIG.camera_axes[0], RIG.camera_axes[1], -RIG.camera_axes[2], RIG.camera]
+                [-rig.camera_axes[0], rig.camera_axes[1], -rig.camera_axes[2], rig.camera]
             ),
             "film": {
                 "type": "hdrfilm",
-                "width": 5 * n // 2,
+                "width": n,
                 "height": n,
-                "crop_offset_x": n // 16,
-                "crop_offset_y": 0,
-                "crop_width": n,
-                "crop_height": n,
                 "rfilter": {"type": "box"},
                 "pixel_format": "rgb",
                 "component_format": "float32",

@@ -45,29 +45,39 @@ GAIN = 2.0  # radiance of the screen's white
 SHIFT, TILT = 3e-3, 3.0  # standard deviations, metres and degrees, of the screen's pose
 
 
-def held_out(materials: Path | None, rooms: Path | None) -> tuple[list[Path], list[Path]]:
-    """Folders of materials and files of rooms whose names the networks never trained on."""
+def choose(
+    materials: Path | None, rooms: Path | None, trained: bool = False
+) -> tuple[list[Path], list[Path]]:
+    """Folders of materials and files of rooms that the networks never trained on.
+
+    trained: every fourth of those that they did train on, so that a few show all families.
+    """
     names = {line.strip() for line in HOLDOUT.read_text().splitlines() if line[:1] != "#"}
-    return (
-        [p for p in find_materials(materials) if p.name in names] if materials else [],
-        [p for p in find_environments(rooms) if p.stem in names] if rooms else [],
-    )
+    samples = find_materials(materials) if materials else []
+    lights = find_environments(rooms) if rooms else []
+    if trained:
+        return [p for p in samples if p.name not in names][::4], [
+            p for p in lights if p.stem not in names
+        ]
+    return [p for p in samples if p.name in names], [p for p in lights if p.stem in names]
 
 
 def make_captures(
     out: Path, count: int, size: int, width: int, spp: int,
     materials: Path | None = None, rooms: Path | None = None,
+    first: int = FIRST_SEED, trained: bool = False,
 ) -> list[Path]:  # fmt: skip
     """Capture folders ``out``/000 and so on; simulates those that are not there yet.
 
     size: pixels a side of the maps; width: of the photos; spp: path tracer's samples. Without
-    folders, materials and rooms are procedural. Capture k depends on k and these alone.
+    folders, materials and rooms are procedural. Capture k depends on k and these alone; others have
+    another ``first`` seed, ``trained`` ones materials and rooms that the networks have seen.
     """
     folders = [out / f"{k:03d}" for k in range(count)]
     for k, folder in enumerate(folders):
         if folder.exists():
             continue
-        maps, room, rng = sample_and_room(k, size, materials, rooms)
+        maps, room, rng = sample_and_room(k, size, materials, rooms, first, trained)
         shift = np.clip(rng.normal(0, SHIFT, 3), -2 * SHIFT, 2 * SHIFT)
         tilt = np.clip(rng.normal(0, TILT, 3), -2 * TILT, 2 * TILT)
         rig = Rig(screen_shift=tuple(shift.tolist()), screen_tilt=tuple(tilt.tolist()))
@@ -88,10 +98,11 @@ def arguments(doc: str | None, quick: str, count: int) -> argparse.ArgumentParse
 
 
 def sample_and_room(
-    k: int, size: int, materials: Path | None, rooms: Path | None, first: int = FIRST_SEED
-) -> tuple[Maps, Array, np.random.Generator]:
+    k: int, size: int, materials: Path | None, rooms: Path | None,
+    first: int = FIRST_SEED, trained: bool = False,
+) -> tuple[Maps, Array, np.random.Generator]:  # fmt: skip
     """The k-th material and room, and the random numbers of what else is drawn for them."""
-    found, found_rooms = held_out(materials, rooms)
+    found, found_rooms = choose(materials, rooms, trained)
     rng = np.random.default_rng(first + k)
     maps = _material(found, k, size) if found else procedural_material(first + k, size, size)
     if found_rooms:
