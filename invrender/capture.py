@@ -13,7 +13,7 @@ from scipy import ndimage, optimize
 
 from invrender.clipped import raise_clipped
 from invrender.errors import InputError
-from invrender.images import Photo, read_image, read_photo
+from invrender.images import PHOTOS, Photo, read_image, read_photo
 from invrender.maps import Maps, read_maps
 from invrender.mirror import Ball
 from invrender.rig import Rig, read_rig
@@ -31,7 +31,6 @@ from invrender.unfold import (
 )
 
 Array = NDArray[np.floating[Any]]
-PHOTO_NAMES = tuple(f"photo.{e}" for e in ("exr", "dng", "tif", "tiff", "png", "jpg", "jpeg"))
 MIN_PHOTO = 64
 
 SATURATED = 0.01  # share of saturated pixels from which it is told, and the screen fitted with care
@@ -95,12 +94,13 @@ def load_capture(folder: Path) -> Capture:
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder")
-    photos = [folder / n for n in PHOTO_NAMES if (folder / n).is_file()]
+    names = {"photo" + suffix for suffix in PHOTOS}
+    photos = sorted(p for p in folder.iterdir() if p.name.lower() in names and p.is_file())
     if not photos:
-        raise InputError(f"{folder} has no photo ({', '.join(PHOTO_NAMES)})")
+        raise InputError(f"{folder} has no photo (photo with one of {', '.join(PHOTOS)})")
     if len(photos) > 1:
-        names = ", ".join(p.name for p in photos)
-        raise InputError(f"{folder} has more than one photo ({names}); leave one")
+        found = ", ".join(p.name for p in photos)
+        raise InputError(f"{folder} has more than one photo ({found}); leave one")
     photo = read_photo(photos[0])
     check_photo(photo, str(photos[0]))
     rig, files = read_rig(folder / "rig.toml", fov=photo.fov)

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 import tifffile
 
+from invrender.capture import load_capture
 from invrender.errors import InputError
-from invrender.images import read_image, read_photo
+from invrender.images import read_image, read_photo, write_exr
+from invrender.rig import Rig, write_rig
 
 WHITE = 16383
 NEUTRAL = np.array([0.5, 1.0, 0.6])  # what the camera sees of white
@@ -103,3 +105,12 @@ def test_damaged_raw_files_are_refused_or_finite(tmp_path):
             assert np.isfinite(read_image(path)).all()
         except InputError as error:
             assert "\n" not in str(error)
+
+
+@pytest.mark.parametrize("name", ["photo.dng", "photo.nef", "PHOTO.CR3"])
+def test_a_capture_may_hold_any_raw_photo(name, tmp_path):
+    pytest.importorskip("rawpy")
+    write_dng(tmp_path / name, ramp(96, 128))
+    write_exr(tmp_path / "pattern.exr", np.full((4, 4, 3), 0.5))
+    write_rig(tmp_path / "rig.toml", Rig(), "pattern.exr")
+    assert load_capture(tmp_path).photo.image.shape == (96, 128, 3)
