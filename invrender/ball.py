@@ -33,7 +33,7 @@ SEARCH = 3.0  # how many radii from where the rig puts it the ball is looked for
 MIN_CONFIDENCE = 0.5
 MIRROR_WEIGHT = 1.0
 OUTLINE_WEIGHT = 0.5  # of the outline beside the horizon: a mirror pales into the table there
-UNSURE = 0.0028  # deviation of the radius that halves the confidence
+UNSURE = 0.0025  # deviation of the radius that halves the confidence
 FINE = 64  # pixels; the ball's radius in the view of the last fit
 
 

@@ -29,7 +29,7 @@ Array = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]
 FINE = 3  # points of a line to each of the view's pixels
 SPACING = 0.014  # of the unknown table's nodes, in radii
-SMOOTH = 3e-3  # weight of their second differences
+ROUGH = 0.08  # usual second difference from one to the next, of the radiance's median
 NEAREST, FARTHEST = 0.80, 3.0  # radii where the lines begin, and to which the table is looked up
 # Lines, blur in the view's pixels, radii to which the table is unknown, steps, radii to start from.
 STAGES = (
@@ -43,7 +43,9 @@ LUMA = (0.2126, 0.7152, 0.0722)  # a JPEG has its colours at half the resolution
 _TILT, _BLUR, _MIRROR = slice(3, 5), 5, 6
 TILT_PRIOR, BLUR_PRIOR, MIRROR_PRIOR = 1.5, 0.15, 0.01
 USUAL_BLUR = 0.8
+OUT = 4.0  # spreads
 ROBUST = 1.5  # spreads from which a residual counts less
+GUESS = 0.01  # of the radiance: its spread, before it is known
 FAITH = 0.004  # of the radiance: the least spread
 HORIZON = 0.5  # of a pixel: the least spread of the horizon's edge
 CORRELATED, EDGES_CORRELATED = 6.0, 5.0  # residuals side by side that tell the same
@@ -106,8 +108,8 @@ class _Fit:
     """A state of the fit: ``cost``, relative ``error`` and its robust ``weight`` (lines, samples),
     and the ``trace`` that it was made from.
 
-    ``table``: (lines, nodes); ``matrix`` (lines, samples, nodes) and ``solver``, its weighted
-    pseudo-inverse; ``scale``: (lines, 1), the radiance that errors are relative to.
+    ``table``: (lines, nodes), over ``scale`` (lines, 1), the usual radiance; ``matrix`` (lines,
+    samples, nodes) and ``solver``, its weighted pseudo-inverse.
     """
 
     cost: float
@@ -127,7 +129,7 @@ class _Lines:
         self, view: View, rig: Rig, p: Array, count: int, blur: float, limit: float
     ) -> None:
         self.view, self.rig, self.blur, self.limit = view, rig, blur, limit
-        light = view.image @ np.array(LUMA)
+        light = _mend(view.image @ np.array(LUMA))
         self.light = ndimage.gaussian_filter(light, blur) if blur else light
         self.farther = ndimage.gaussian_filter(light, blur + 1)
         outline = curves(view, _tilted(rig, p), p, 2)[2]
@@ -139,7 +141,7 @@ class _Lines:
         self.points = np.arange(low - 4 + 0.5 / FINE, high + 4, 1 / FINE)
         self.nodes = max(4, round(1 + (limit - 1) / (SPACING * (1 + blur))))
         bend = np.diff(np.eye(self.nodes), 2, axis=0)
-        self.smooth = SMOOTH * bend.T @ bend + 1e-6 * np.eye(self.nodes)
+        self.bend = bend.T @ bend / ROUGH**2
         self.mirror = float(np.asarray(rig.ball_reflectance) @ LUMA)
         # Steps of the unknowns. A tilt moves the whole image: the ball goes along with it.
         self.units = np.diag([*np.full(3, p[2] * 2e-3), 0.1, 0.1, 0.05, 0.01])
@@ -223,23 +225,26 @@ class _Lines:
             * (1 - t.inside)[..., None]
         )
         matrix = kernel @ hats
-        right = t.seen - (known * t.far * mirror) @ kernel.T
+        scale = np.median(t.seen, 1, keepdims=True) + 1e-3 * t.seen.mean()
+        right = (t.seen - (known * t.far * mirror) @ kernel.T) / scale
         weight = valid * (1.0 if weight is None else weight)
         weighted = (matrix * weight[..., None]).transpose(0, 2, 1)
-        solver = np.linalg.solve(weighted @ matrix + self.smooth, weighted)
+        smooth = spread**2 * self.bend + 1e-6 * np.eye(self.nodes)
+        solver = np.linalg.solve(weighted @ matrix + smooth, weighted)
         table = (solver @ right[..., None])[..., 0]
-        scale = np.median(t.seen, 1, keepdims=True) + 1e-3 * t.seen.mean()
-        error = (right - (matrix @ table[..., None])[..., 0]) / scale
+        error = right - (matrix @ table[..., None])[..., 0]
         relative = (error / (ROBUST * spread)) ** 2
         # A sample that the photo leaves open costs what a usual one does.
         cost = float(np.log1p(np.where(valid, relative, 0.25)).sum()) * ROBUST**2 / CORRELATED
+        cost += float(np.sum((table @ self.bend) * table)) / CORRELATED
         *_, off, strength = self.horizon(p)
         cost += float((strength * np.log1p((off / edge) ** 2)).sum()) / EDGES_CORRELATED
         cost += float(self.prior @ (self.off(p) ** 2))
         return _Fit(cost, error, valid / (1 + relative), t, table, matrix, solver, scale)
 
-    def residual(self, p: Array, t: _Trace, table: Array) -> Array:
-        """The photo along the lines less what it should be with the ball at ``p`` on ``table``."""
+    def residual(self, p: Array, t: _Trace, fit: _Fit) -> Array:
+        """The photo along the lines less what it should be with the ball at ``p``, relative."""
+        table = fit.table
         row = np.arange(len(table))[:, None]
 
         def look(distance: Array) -> Array:
@@ -247,10 +252,10 @@ class _Lines:
             i = q.astype(int)
             return np.asarray(table[row, i] + (table[row, i + 1] - table[row, i]) * (q - i))
 
-        inside = np.where(t.mirrored > self.limit, t.far, look(t.mirrored))
+        inside = np.where(t.mirrored > self.limit, t.far / fit.scale, look(t.mirrored))
         light = t.inside * self.mirror * math.exp(p[_MIRROR]) * inside
         light += (1 - t.inside) * look(t.direct)
-        return np.asarray(t.seen - light @ self.kernel(p).T)
+        return np.asarray(t.seen / fit.scale - light @ self.kernel(p).T)
 
     def off(self, p: Array) -> Array:
         """How far the unknowns are from what the prior expects; nought for the ball itself."""
@@ -264,7 +269,7 @@ class _Lines:
 
     def spreads(self, p: Array) -> tuple[float, float]:
         """The usual residual of the lines with the ball at ``p``, and of the horizon's edge."""
-        fit = self.solve(p, 1.0, 1.0, None)
+        fit = self.solve(p, GUESS, 1.0, None)
         rest = np.abs(fit.error[fit.weight > 0])
         off, strength = self.horizon(p)[2:]
         strong = np.abs(off[strength > 0.1])
@@ -302,14 +307,14 @@ class _Lines:
         self, p: Array, fit: _Fit, spread: float, edge: float
     ) -> tuple[Array, Array]:
         """Gauss–Newton's matrix (7, 7) and the gradient (7,), in `units`."""
-        base = self.residual(p, fit.trace, fit.table)
+        base = self.residual(p, fit.trace, fit)
         columns = []
         for k, unit in enumerate(self.units):
             # Blur and reflectance move no ray.
             trace = self.trace(p + unit) if k < _BLUR else fit.trace
-            column = self.residual(p + unit, trace, fit.table) - base
+            column = self.residual(p + unit, trace, fit) - base
             column -= (fit.matrix @ (fit.solver @ column[..., None]))[..., 0]
-            columns.append((column / fit.scale).reshape(-1))
+            columns.append(column.reshape(-1))
         slope = np.stack(columns)
         weighted = slope * (fit.weight.reshape(-1) / spread**2 / CORRELATED)
         matrix = self.units @ np.diag(self.prior) @ self.units.T + weighted @ slope.T
@@ -321,6 +326,13 @@ class _Lines:
             slope[k] = np.sum((moved - curve) * normal, -1)
         weighted = slope * (strength / (1 + (off / edge) ** 2) / edge**2 / EDGES_CORRELATED)
         return matrix + weighted @ slope.T, gradient - weighted @ off
+
+
+def _mend(image: Array) -> Array:
+    """The image (h, w) with single pixels replaced that stand out from the eight around them."""
+    usual = ndimage.median_filter(image, 3)
+    off = np.abs(image - usual)
+    return np.where(off > OUT * 1.48 * np.median(off), usual, image)
 
 
 def _look(image: Array, at: Array) -> Array:
