@@ -20,15 +20,21 @@ D, S, R, N = slice(0, 3), slice(3, 6), 6, slice(7, 9)  # places of the parameter
 
 MIN_ROUGHNESS = 0.03
 MAX_SLOPE = 3.0  # 72 degrees
+UNTOLD = np.array([1] * 3 + [1] * 3 + [1] + [1] * 2, np.float32)
 
 
 @dataclass
 class Prior:
-    """mean, sigma: (H, W, 9) in the order of θ; correlation: (9, 9), of the deviations."""
+    """mean, sigma: (H, W, 9) in the order of θ; correlation: (9, 9), of the deviations.
+
+    total: (H, W, 9), the expected error where ``sigma`` is only what a pixel may move by, without
+    what its whole material shares; None where they are the same.
+    """
 
     mean: Array
     sigma: Array
     correlation: Array
+    total: Array | None = None
 
 
 def lobe_prior(maps: Maps) -> Prior:
@@ -46,15 +52,18 @@ def network_prior(maps: Maps, sigma: dict[str, Array]) -> Prior:
     """The uncertainty of a network's maps, from what it expects of its errors, (H, W) a map.
 
     ``sigma`` of normals is that of n/2 + 1/2. An albedo's error within a material is at most a
-    share of it.
+    share of it; the total error is `UNTOLD` times what the network expects.
     """
     mean = to_theta(maps)
-    spread = np.empty_like(mean)
-    spread[..., D] = np.minimum(sigma["diffuse"][..., None], 0.01 + 0.15 * maps.diffuse)
-    spread[..., S] = np.minimum(sigma["specular"][..., None], 0.01 + 0.3 * maps.specular)
-    spread[..., R] = sigma["roughness"]
-    spread[..., N] = 2 * sigma["normal"][..., None]
-    return Prior(mean, np.maximum(spread, 1e-4), _correlation(0.9, 0.95))
+    total = np.empty_like(mean)
+    total[..., D], total[..., S] = (sigma[k][..., None] for k in ("diffuse", "specular"))
+    total[..., R] = sigma["roughness"]
+    total[..., N] = 2 * sigma["normal"][..., None]
+    total = np.maximum(total, 1e-4)
+    spread = total.copy()
+    spread[..., D] = np.minimum(total[..., D], 0.01 + 0.15 * maps.diffuse)
+    spread[..., S] = np.minimum(total[..., S], 0.01 + 0.3 * maps.specular)
+    return Prior(mean, spread, _correlation(0.9, 0.95), UNTOLD * total)
 
 
 def _correlation(diffuse: float, specular: float) -> Array:
@@ -74,9 +83,11 @@ def pooled(priors: Sequence[Prior]) -> Prior:
     if len(priors) == 1:
         return priors[0]
     precision = [1 / p.sigma**2 for p in priors]
-    total = np.sum(precision, 0)
-    mean = np.sum([w * p.mean for w, p in zip(precision, priors, strict=True)], 0) / total
-    return Prior(mean, np.sqrt(len(priors) / total), priors[0].correlation)
+    sum_ = np.sum(precision, 0)
+    mean = np.sum([w * p.mean for w, p in zip(precision, priors, strict=True)], 0) / sum_
+    totals = [p.sigma if p.total is None else p.total for p in priors]
+    total = np.sqrt(len(priors) / np.sum([1 / t**2 for t in totals], 0))
+    return Prior(mean, np.sqrt(len(priors) / sum_), priors[0].correlation, total)
 
 
 def to_theta(maps: Maps) -> Array:
