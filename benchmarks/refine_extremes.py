@@ -3,8 +3,8 @@
     python benchmarks/refine_extremes.py [--quick] --out DIR
 
 Photos are rendered by the forward model from known maps and refined without a network, with the
-true lights unless the case says otherwise. A case ends well if the photo is explained to within
-`invrender.pipeline.POOR_FIT`; where it is not, a run warns.
+true lights unless the case says otherwise. A run warns where the photo is not explained to within
+`invrender.pipeline.POOR_FIT`, or where the albedo's colours follow the light's (`BAKED`).
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ import numpy as np
 from common import markdown, write_results
 
 from invrender.environments import procedural_environment, scale_environment
-from invrender.initial import flat_maps
+from invrender.initial import baked_light, flat_maps
 from invrender.lobes import fit_lobes
 from invrender.maps import Maps, constant_maps, map_errors
 from invrender.pattern import default_pattern
-from invrender.pipeline import POOR_FIT
+from invrender.pipeline import BAKED, POOR_FIT
 from invrender.prior import lobe_prior
 from invrender.refine import Shot, refine
 from invrender.render import make_scene, picture, prepare
@@ -100,6 +100,8 @@ def run(case: Case, seed: int) -> dict[str, Any]:
     seconds = time.perf_counter() - began
     images = [*result.maps.encoded().values(), result.sigma]
     before, after = map_errors(start, case.maps), map_errors(result.maps, case.maps)
+    baked = baked_light(result.maps.diffuse, prepared)
+    poor = result.history[-1]["photo_error"] > POOR_FIT["flat"]
     kept = None
     if clipped is not None:
         same = np.abs(result.maps.diffuse - lobes.diffuse)[clipped].max()
@@ -110,7 +112,8 @@ def run(case: Case, seed: int) -> dict[str, Any]:
         "photo_error": result.history[-1]["photo_error"],
         "iterations": len(result.history) - 1,
         "converged": result.converged,
-        "warns": not result.converged or result.history[-1]["photo_error"] > POOR_FIT,
+        "baked": baked,
+        "warns": not result.converged or poor or baked > BAKED,
         "finite": bool(all(np.isfinite(i).all() for i in images)),
         "greatest albedo": float((result.maps.diffuse + result.maps.specular).max()),
         "moved where clipped": kept,
@@ -131,11 +134,11 @@ def main() -> None:
         maps = [f"{r['initial'][n]:.3f} → {r['refined'][n]:.3f}" for n in r["initial"]]
         end = "yes" if r["converged"] else "no"
         end += ", warns" if r["warns"] else ""
-        row = [name, *maps, r["photo_error"], r["iterations"], end, r["seconds"]]
+        row = [name, *maps, r["photo_error"], r["baked"], r["iterations"], end, r["seconds"]]
         rows.append(row)
         print(*row, "" if r["finite"] else "NOT FINITE", flush=True)
     names = [*next(iter(results.values()))["initial"]]
-    header = ["case", *names, "photo error", "steps", "converged", "seconds"]
+    header = ["case", *names, "photo error", "light in albedo", "steps", "converged", "seconds"]
     (args.out / "refine_extremes.md").write_text(markdown(header, rows))
     write_results(args.out, {"cases": results})
 

@@ -36,7 +36,9 @@ if TYPE_CHECKING:  # Dr.Jit compiles where the refinement is imported
 Array = NDArray[np.floating[Any]]
 FINAL_SAMPLES = 256
 FAR_OFF = 0.1  # of its size that the screen may hang off before the rig is in doubt
-POOR_FIT = 0.3  # photo error from which the maps are in doubt
+# Photo error from which the maps are in doubt; from a flat start each pixel's albedo explains more.
+POOR_FIT = {"network": 0.3, "flat": 0.15}
+BAKED = 0.6  # correlation of albedo and light, negative, from which the lights are in doubt
 
 
 @dataclass(frozen=True)
@@ -237,9 +239,11 @@ def refine_capture(
     start, result, shots = recover(seen, stage, init=init, samples=samples)
     first = seen[0]
     with stage("render"):
+        from invrender.initial import baked_light
         from invrender.render import picture
 
         lights = shots[0].prepared
+        baked = baked_light(result.maps.diffuse, lights, samples)
         pictures = [picture(lights, maps, FINAL_SAMPLES) for maps in (start, result.maps)]
     before, after = (_photo_error(p, first.photo, first.clipped) for p in pictures)
     errors = None
@@ -256,7 +260,7 @@ def refine_capture(
         converged=result.converged,
         history=result.history,
         capture_fit=_capture_fit(first),
-        warnings=_warnings(first, after, result),
+        warnings=_warnings(first, after, result, init, baked),
         map_error=errors,
         versions={n: version(n) for n in ("invrender", "drjit", "mitsuba", "numpy")},
     )
@@ -297,7 +301,7 @@ def _photo_error(picture: Array, photo: Array, clipped: NDArray[np.bool_]) -> fl
     return float(np.sqrt(np.mean(difference**2)) / max(float(photo[seen].mean()), 1e-12))
 
 
-def _warnings(seen: Seen, error: float, result: Refined) -> list[str]:
+def _warnings(seen: Seen, error: float, result: Refined, init: str, baked: float) -> list[str]:
     warnings = [*seen.turned, *light_warnings(seen.lights)]
     clipped, fit = seen.clipped, seen.lights.fit
     if fit.get("screen_shift", 0) > FAR_OFF * seen.lights.rig.screen_size:
@@ -314,7 +318,12 @@ def _warnings(seen: Seen, error: float, result: Refined) -> list[str]:
         warnings.append("interrupted: these are the best maps so far")
     elif not result.converged:
         warnings.append("refinement had not converged when it reached its step limit")
-    if error > POOR_FIT:
+    if baked > BAKED:
+        warnings.append(
+            f"the albedo's colours follow the light's (correlation -{baked:.1f}): the light is "
+            "probably not where or what it is taken for; check the rig's sizes and the ball"
+        )
+    if error > POOR_FIT[init]:
         warnings.append(
             f"the maps explain the photo only to within {error:.0%} of its mean: check the rig's "
             "sizes, the pattern and the ball"

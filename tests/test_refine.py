@@ -1,16 +1,19 @@
 """Initial maps, lobes and refinement on photos rendered from known maps."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from invrender import refine as refinement
 from invrender.environments import procedural_environment, scale_environment
-from invrender.initial import flat_maps
+from invrender.initial import baked_light, flat_maps
 from invrender.joint import find_turn, turned_environment, turned_rig
 from invrender.lobes import fit_lobes
 from invrender.maps import constant_maps, map_errors
 from invrender.materials import procedural_material, turn_maps
 from invrender.pattern import block_pattern
+from invrender.pipeline import BAKED
 from invrender.prior import (
     MIN_ROUGHNESS,
     Prior,
@@ -246,3 +249,16 @@ def test_interrupt_keeps_the_best_so_far(prepared, environment):
     assert result.interrupted and not result.converged
     error = np.abs(result.maps.diffuse - truth.diffuse).mean()
     assert error < np.abs(prior.mean[..., :3] - truth.diffuse).mean()
+
+
+def test_albedo_that_makes_up_for_wrong_lights_is_told(prepared, environment):
+    """A matt sample: the photo is explained in any rig, but the albedo's colours tell."""
+    truth = constant_maps(SIZE, SIZE, (0.5, 0.35, 0.2), 0.04, 0.5)
+    high = replace(RIG, screen_height=1.2 * RIG.screen_height)
+    photos = photo_of(truth, environment), render(high, truth, PATTERN, environment, GAIN)
+    right, wrong = (baked_light(flat_maps(p, prepared).diffuse, prepared) for p in photos)
+    assert right < 0.3 and wrong > BAKED
+    dark = constant_maps(SIZE, SIZE, 0.0)
+    assert baked_light(dark.diffuse, prepared) == 0
+    plain = prepare(make_scene(RIG, np.ones((4, 4, 3), np.float32), None, 1.0))
+    assert baked_light(truth.diffuse, plain) == 0
