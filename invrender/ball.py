@@ -33,7 +33,8 @@ SEARCH = 3.0  # how many radii from where the rig puts it the ball is looked for
 MIN_CONFIDENCE = 0.5
 MIRROR_WEIGHT = 1.0
 OUTLINE_WEIGHT = 0.5  # of the outline beside the horizon: a mirror pales into the table there
-UNSURE = 0.0025  # deviation of the radius that halves the confidence
+UNSURE = 0.0012  # deviation of the radius, relative, that takes half of `DOUBT` of the confidence
+DOUBT = 0.4
 FINE = 64  # pixels; the ball's radius in the view of the last fit
 
 
@@ -74,7 +75,8 @@ def find_ball(photo: Photo, rig: Rig, manual: tuple[float, float, float] | None 
     found = make_ball(rig, np.array([theta[0], theta[1], 0.0]), theta[2], size)
     fine = view_around(photo, np.asarray(found.centre), 3.3 * found.radius, found.radius / FINE)
     rim = fit_rim(fine, rig, theta)
-    confidence = _confidence(view, rim.rig, rim.theta) / (1 + (rim.deviation / UNSURE) ** 2)
+    doubt = DOUBT / (1 + (UNSURE / max(rim.deviation, 1e-9)) ** 2)
+    confidence = _confidence(view, rim.rig, rim.theta) * (1 - doubt)
     seen = make_ball(rim.rig, np.array([*rim.theta[:2], 0.0]), rim.theta[2], size)
     ball = replace(place_ball(rig, size, *seen.centre, seen.radius), confidence=confidence)
     (x, y), r = ball.centre, ball.radius

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, optimize
+from scipy import ndimage
 
 from invrender.clipped import raise_clipped
 from invrender.errors import InputError
@@ -17,13 +17,11 @@ from invrender.images import PHOTOS, Photo, read_image, read_photo
 from invrender.maps import Maps, read_maps
 from invrender.mirror import Ball
 from invrender.rig import Rig, read_rig
-from invrender.screen import fit_screen
+from invrender.screen import SATURATED, fit_screen
 from invrender.unfold import (
     fill_environment,
     pixel_grid,
-    predict_pattern,
     screen_coordinates,
-    screen_lookup,
     trace_ball,
     unfold_environment,
     unfold_pattern,
@@ -33,13 +31,10 @@ from invrender.unfold import (
 Array = NDArray[np.floating[Any]]
 MIN_PHOTO = 64
 
-SATURATED = 0.01  # share of saturated pixels from which it is told, and the screen fitted with care
 # Residual of the ideal pattern from which the ball shows another pattern, or is none: nine
 # hard simulated balls had at most 0.12, nine wrong ones at least 0.29.
 NO_PATTERN = 0.22
 SURE = 0.75  # confidence from which a ball is one even if its pattern fits as badly
-NO_CURVE = 0.2  # share of saturated pixels from which gain and gamma cannot be told apart
-POOR = 0.01  # residual of the ideal pattern from which the screen itself is in doubt
 # Shift in sizes of the sample, and tilt in degrees, that an error of the ball's place, a hundredth
 # of its radius, cannot explain: a smaller one is taken for such an error.
 MOVED = (0.022, 1.0)
@@ -196,70 +191,6 @@ def sample_corners(photo: Photo, rig: Rig) -> Array:
     return corners
 
 
-def fit_gain(photo: Photo, rig: Rig, ball: Ball, pattern: Array) -> tuple[Array, dict[str, float]]:
-    """Gain (3,) of the screen: its radiance over the ideal pattern, from the ball's image.
-
-    Every pixel inside the screen's image is compared with what it should average of the pattern,
-    under the camera's blur, which is fitted as well. Weights fall with the residual (iteratively
-    reweighted least squares, Huber); saturated pixels are left out. ``fit`` as in `Lights`. Raises
-    `InputError` if the ball does not show the screen, or shows it dark.
-    """
-    n = 4 if ball.radius < 80 else 2
-    lookup, hit, (rows, columns) = screen_lookup(rig, ball, pattern.shape[:2], n)
-    # Only the part of the window that shows the screen, and around it what blurs into it.
-    inside = np.argwhere(hit)
-    if len(inside) == 0:
-        raise InputError("the ball cannot show the screen: check the rig's sizes")
-    low = np.maximum(inside.min(0) // n - 4, 0)
-    high = inside.max(0) // n + 5
-    part = slice(n * low[0], n * high[0]), slice(n * low[1], n * high[1])
-    lookup, hit = lookup[part], hit[part]
-    rows = slice(rows.start + low[0], min(rows.start + high[0], rows.stop))
-    columns = slice(columns.start + low[1], min(columns.start + high[1], columns.stop))
-    captured = photo.image[rows, columns] / np.asarray(rig.ball_reflectance)
-    # Pixels that see nothing but the screen, and whose neighbours do.
-    whole = predict_pattern(pattern, lookup, hit, 0, n)[..., 3] > 0.999
-    use = ndimage.binary_erosion(whole) & ~photo.clipped[rows, columns]
-    if use.sum() < 12:
-        raise InputError(
-            "the ball's image shows too little of the screen, or it is saturated there"
-        )
-    values = captured[use].astype(float)
-
-    def solve(blur: float, gamma: float) -> tuple[float, Array]:
-        predicted = predict_pattern(pattern**gamma, lookup, hit, blur, n)[use][:, :3].astype(float)
-        gain = np.zeros(3)
-        squares = 0.0
-        for c in range(3):
-            x, y = predicted[:, c], values[:, c]
-            weight = np.ones_like(x)
-            for _ in range(15):
-                gain[c] = (weight * x * y).sum() / max((weight * x * x).sum(), 1e-12)
-                error = np.abs(y - gain[c] * x)
-                spread = max(2 * float(np.median(error)), 1e-12)
-                weight = np.minimum(1, spread / np.maximum(error, 1e-12))
-            squares += float((weight * error**2).sum() / weight.sum())
-        return math.sqrt(squares / 3) / max(float(gain.mean()), 1e-12), gain
-
-    def cost(u: Array) -> float:
-        outside = max(0.0, -u[0]) + max(0.0, u[0] - 3) + 5 * max(0.0, abs(u[1]) - 1)
-        return solve(min(max(u[0], 0.0), 3.0), math.exp(u[1]))[0] * (1 + outside)
-
-    start = np.array([[0.2, 0.0], [1.0, 0.0], [0.2, 0.2]])
-    options = {"initial_simplex": start, "xatol": 0.005, "fatol": 1e-5, "maxfev": 60}
-    found = optimize.minimize(cost, start[0], method="Nelder-Mead", options=options)
-    blur, gamma = min(max(float(found.x[0]), 0.0), 3.0), math.exp(float(found.x[1]))
-    residual, gain = solve(blur, 1.0)
-    if not (gain > 0).all():
-        raise InputError("the screen is dark in the ball's image: is the pattern displayed?")
-    saturated = float(photo.clipped[rows, columns][whole].mean())
-    fit = {
-        "residual": residual, "gamma": gamma, "blur": blur, "pixels": float(use.sum()),
-        "saturated": saturated,
-    }  # fmt: skip
-    return gain, fit
-
-
 def not_the_pattern(ball: Ball) -> InputError:
     """What is wrong with a ball whose image of the screen is another's."""
     (x, y), r = ball.centre, ball.radius
@@ -277,24 +208,19 @@ def extract_lights(capture: Capture, ball: Ball, height: int = 128) -> Lights:
         raise InputError("the ball was found in a photo of another size")
     if height < 8 or height % 2:
         raise InputError(f"the environment needs an even height of 8 rows or more, got {height}")
-    pattern = capture.pattern
-    gain, fit = fit_gain(photo, rig, ball, pattern)
-    fit["pattern_residual"] = fit["residual"]
-    if fit["residual"] > POOR or fit["saturated"] > SATURATED:
-        screen = fit_screen(photo, rig, ball, pattern, curve=fit["saturated"] < NO_CURVE)
-        # It knows that a saturated pixel had at least so much light; `fit_gain` leaves it out.
-        if screen.residual < 0.5 * fit["residual"] or fit["saturated"] > SATURATED:
-            pattern, gain = screen.shown, screen.gain
-            shift, tilt = (
-                np.linalg.norm(screen.rig.screen_shift),
-                np.linalg.norm(screen.rig.screen_tilt),
-            )
-            if shift > MOVED[0] * rig.sample_size or tilt > MOVED[1]:
-                rig = screen.rig
-            fit |= {
-                "residual": screen.residual, "gamma": float(np.mean(screen.gamma)),
-                "screen_shift": float(shift), "screen_tilt": float(tilt),
-            }  # fmt: skip
+    screen = fit_screen(photo, rig, ball, capture.pattern)
+    pattern, gain = screen.shown, screen.gain
+    shift, tilt = (
+        float(np.linalg.norm(np.subtract(getattr(screen.rig, n), getattr(rig, n))))
+        for n in ("screen_shift", "screen_tilt")
+    )
+    if shift > MOVED[0] * rig.sample_size or tilt > MOVED[1]:
+        rig = screen.rig
+    fit = {
+        "residual": screen.residual, "pattern_residual": screen.ideal_residual,
+        "gamma": float(np.mean(screen.gamma)), "blur": screen.blur, "pixels": float(screen.pixels),
+        "saturated": screen.saturated, "screen_shift": shift, "screen_tilt": tilt,
+    }  # fmt: skip
     # A display far from its place or with another curve explains a poor ideal fit, if it fits.
     if (
         fit["pattern_residual"] > NO_PATTERN

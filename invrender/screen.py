@@ -29,6 +29,10 @@ TILT_PRIOR = 6.0  # of its tilt, degrees
 GAMMA_PRIOR, CHANNEL_PRIOR = 0.5, 0.03  # of log gamma, and of the channels' differences in it
 FINEST = 100.0  # a ball of more pixels in radius is shrunk for the fit
 CELLS = 128  # of the pattern in the fit
+POOR = 0.01  # residual of the screen as it should be from which it is in doubt
+BETTER = 0.7  # of it, from which another pose or curve is believed
+SATURATED = 0.01  # share of saturated pixels from which it is told, and the screen fitted with care
+NO_CURVE = 0.2  # share of saturated pixels from which gain and gamma cannot be told apart
 EDGE = 3  # pixels outside the screen's image that are compared as well
 
 
@@ -38,9 +42,10 @@ class Screen:
 
     ``rig``: with the screen's shift and tilt; ``shown`` (h, w, 3): the pattern through the
     display's curve, ``gamma`` (3,); its radiance is ``gain`` (3,) times that. ``blur`` is the
-    camera's in pixels, ``residual`` the fit's RMS over the mean gain, ``deviation`` the standard
-    deviations that the fit expects of the shift (metres) and the tilt (degrees), ``pixels`` the
-    number that lie on the screen and are not saturated, ``saturated`` the share that is.
+    camera's in pixels, ``residual`` the fit's RMS over the mean gain, ``ideal_residual`` that of
+    the screen as it should be, ``deviation`` the standard deviations that the fit expects of the
+    shift (metres) and the tilt (degrees), ``pixels`` the number that lie on the screen and are not
+    saturated, ``saturated`` the share that is.
     """
 
     rig: Rig
@@ -49,24 +54,33 @@ class Screen:
     gamma: Array
     blur: float
     residual: float
+    ideal_residual: float
     deviation: tuple[float, float]
     pixels: int
     saturated: float
 
 
-def fit_screen(
-    photo: Photo, rig: Rig, ball: Ball, pattern: Array, *, move: bool = True, curve: bool = True
-) -> Screen:
+def fit_screen(photo: Photo, rig: Rig, ball: Ball, pattern: Array) -> Screen:
     """Register the ``pattern`` (h, w, 3), relative radiance, with the ball's image of the screen.
 
-    ``move`` and ``curve`` say whether pose and gamma are unknown. Raises `InputError` if the ball
-    cannot show the screen, or shows it saturated or dark.
+    Gain and blur first, for the screen as it should be. Where that fits worse than to `POOR`, or
+    the screen is saturated, its pose and the display's curve are fitted too; where more than
+    `NO_CURVE` is saturated the curve cannot be told from the gain and is taken as straight. Raises
+    `InputError` if the ball cannot show the screen, or shows it saturated or dark.
     """
-    fit = _Fit(photo, rig, ball, pattern, move, curve)
-    start = fit.start()
+    fit = _Fit(photo, rig, ball, pattern)
+    ideal = fit.result(fit.solve(fit.start(), 0.0, 6))
+    if ideal.residual < POOR and ideal.saturated < SATURATED:
+        return ideal
+    fit.free[:] = True
+    fit.free[_GAMMA] = ideal.saturated < NO_CURVE
+    u = fit.start()
     for blur, turns in ((2.5, 8), (1.0, 8), (0.0, 14)):
-        start = fit.solve(start, blur * max(1.0, fit.radius / 60), turns)
-    return fit.result(start)
+        u = fit.solve(u, blur * max(1.0, fit.radius / 60), turns)
+    moved = replace(fit.result(u), ideal_residual=ideal.residual)
+    # A saturated pixel had at least so much light, which the ideal screen alone may not explain.
+    better = moved.residual < BETTER * ideal.residual or ideal.saturated > SATURATED
+    return moved if better else ideal
 
 
 # Places of the unknowns: shift and tilt in units of their priors, log gamma and log gain a channel,
@@ -78,10 +92,10 @@ _STEP = 0.02  # of finite differences
 class _Fit:
     """The ball's image around the screen, the rays that its sub-pixels see, and the fit's steps."""
 
-    def __init__(
-        self, photo: Photo, rig: Rig, ball: Ball, pattern: Array, move: bool, curve: bool
-    ) -> None:
-        self.rig, self.full, self.move, self.curve = rig, pattern, move, curve
+    def __init__(self, photo: Photo, rig: Rig, ball: Ball, pattern: Array) -> None:
+        self.rig, self.full = rig, pattern
+        self.free = np.zeros(13, bool)
+        self.free[_GAIN], self.free[_BLUR] = True, True
         self.step = step = max(1, round(ball.radius / FINEST))
         self.radius = ball.radius / step
         self.samples = n = 4 if self.radius < 50 else 3 if self.radius < 80 else 2
@@ -155,7 +169,10 @@ class _Fit:
         values[on, :-1] = sum(flat[k] * f for k, f in corners) * weight
         values[..., -1] = cover
         h, w = s.shape[0] // n, s.shape[1] // n
-        out = values.reshape(h, n, w, n, -1).mean((1, 3))
+        out = np.zeros((h, w, values.shape[-1]), np.float32)
+        for a in range(n):
+            for b in range(n):
+                out += values[a::n, b::n] / np.float32(n * n)
         sigma = math.hypot(max(float(u[_BLUR]), 0.0), self.blurred)
         if sigma > 0.05:
             out = ndimage.gaussian_filter(out, (sigma, sigma, 0), truncate=3)
@@ -204,9 +221,7 @@ class _Fit:
         if blurred:
             clipped = ndimage.maximum_filter(clipped, (3, 3, 1))
         damping = 1e-2
-        free = np.ones(13, bool)
-        free[:6] = self.move
-        free[_GAMMA] = self.curve
+        free = self.free
         for _ in range(turns):
             shown = self.pattern ** np.exp(u[_GAMMA]).astype(np.float32)
             slope = shown * np.log(self.pattern) * np.exp(u[_GAMMA]).astype(np.float32)
@@ -246,7 +261,7 @@ class _Fit:
             u = u + delta
             u[_BLUR] = np.clip(u[_BLUR], 0, 3)
             self.information = matrix
-            if np.abs(delta).max() < 2e-3:
+            if np.abs(delta).max() < (0.01 if blurred else 2e-3):
                 break
         return u
 
@@ -266,6 +281,14 @@ class _Fit:
         deviation = np.hypot(max(a, 0.003) * shot, (1 - share)[..., None] * spread)
         return deviation, error / deviation
 
+    def rest(self, seen: NDArray[np.bool_]) -> Array:
+        """Root mean square of what pixels differ by from the model, with Huber's weights."""
+        if not seen.any():
+            return np.array(0.0)
+        error = np.abs(self.error * self.scale)[seen]
+        weight = np.minimum(1, 2 * np.median(error, 0) / np.maximum(error, 1e-12))
+        return np.asarray(np.sqrt(((weight * error**2).sum(0) / weight.sum(0)).mean()))
+
     def prior(self, u: Array) -> tuple[Array, Array]:
         """The prior's information (13, 13) and its gradient at ``u``."""
         matrix = np.zeros((13, 13))
@@ -282,10 +305,9 @@ class _Fit:
         gamma, gain = np.exp(u[_GAMMA]), np.exp(u[_GAIN])
         inside = self.share > 0.98
         seen = inside & ~self.clipped.any(-1)
-        error = (self.error * self.scale)[inside]
-        residual = float(np.sqrt(np.median(error**2) / 0.455)) / float(gain.mean())
+        residual = float(self.rest(seen)) / float(gain.mean())
         spread = np.zeros(6)
-        if self.move:
+        if self.free[0]:
             spread = np.sqrt(np.diag(np.linalg.inv(self.information))[:6])
         units = SHIFT_PRIOR * self.rig.sample_size, TILT_PRIOR
         return Screen(
@@ -295,6 +317,7 @@ class _Fit:
             gamma=gamma,
             blur=float(u[_BLUR]) * self.step,
             residual=residual,
+            ideal_residual=residual,
             deviation=(
                 float(np.linalg.norm(spread[:3])) * units[0],
                 float(np.linalg.norm(spread[3:])) * units[1],

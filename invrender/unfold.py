@@ -206,39 +206,3 @@ def unfold_pattern(photo: Photo, rig: Rig, ball: Ball, size: int = 256, samples:
     light = sample_image(photo.image[rows, columns], pixels, (rows.start, columns.start))
     light = light.reshape(size, samples, size, samples, 3).mean((1, 3))
     return (light / np.asarray(rig.ball_reflectance)).astype(np.float32)
-
-
-def screen_lookup(
-    rig: Rig, ball: Ball, shape: tuple[int, int], samples: int = 4
-) -> tuple[NDArray[np.intp], Mask, tuple[slice, slice]]:
-    """Which pixel of a pattern of that shape each sub-pixel of the ball's image sees.
-
-    Returns flat indices (H·samples, W·samples) into the pattern, a mask of those that see the
-    screen at all, and the window of the photo they cover.
-    """
-    rows, columns = area = window(ball)
-    point, mirrored, seen = trace_ball(rig, ball, pixel_grid(rows, columns, samples))
-    s, t, hit = screen_coordinates(rig, point, mirrored)
-    hit &= seen
-    h, w = shape
-    column = np.clip((np.where(hit, s, 0) * w).astype(int), 0, w - 1)
-    row = np.clip(((1 - np.where(hit, t, 0)) * h).astype(int), 0, h - 1)
-    return row * w + column, hit, area
-
-
-def predict_pattern(
-    pattern: Array, lookup: NDArray[np.intp], hit: Mask, blur: float, samples: int = 4
-) -> Array:
-    """What the ball's image shows of a pattern (h, w, 3): (H, W, 4), the last the screen's share.
-
-    ``lookup`` and ``hit`` come from `screen_lookup` with as many ``samples``; each pixel averages
-    its own, after a Gaussian point spread with a standard deviation of ``blur`` pixels.
-    """
-    out = np.concatenate([pattern.reshape(-1, 3)[lookup], np.ones((*hit.shape, 1))], -1)
-    out = (out * hit[..., None]).astype(np.float32)
-    if blur > 0.05:
-        out = ndimage.gaussian_filter(out, (samples * blur, samples * blur, 0), truncate=3)
-    height, width = hit.shape
-    return np.asarray(
-        out.reshape(height // samples, samples, width // samples, samples, 4).mean((1, 3))
-    )
