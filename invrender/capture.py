@@ -30,6 +30,7 @@ from invrender.unfold import (
 
 Array = NDArray[np.floating[Any]]
 MIN_PHOTO = 64
+MAX_SAMPLES = 8  # of the photo to a pixel of the crop, a side; beyond, the photo is smoothed first
 
 # Residual of the ideal pattern from which the ball shows another pattern, or is none: nine
 # hard simulated balls had at most 0.12, nine wrong ones at least 0.29.
@@ -155,13 +156,17 @@ def crop_sample(photo: Photo, rig: Rig, size: int = 256) -> Array:
     x1, y1 = np.minimum(np.ceil(high).astype(int) + 8, [w, h])
     crop = photo.image[y0:y1, x0:x1]
     scale = float((high - low).max()) / size  # photo pixels in one of the crop's
-    samples = max(1, math.ceil(scale))
+    samples = min(max(1, math.ceil(scale)), MAX_SAMPLES)
+    wide = 2 * round((scale / samples - 1) / 2) + 1  # odd, so that nothing moves
     order = 3 if scale < 2 else 1  # the mean over many pixels needs no splines
     pixels = rig.project(rig.sample_points(size * samples, size * samples), h, w)
     at = np.stack([pixels[..., 1] - y0 - 0.5, pixels[..., 0] - x0 - 0.5])
     planes = []
     for c in range(3):
-        plane = ndimage.map_coordinates(crop[..., c], at, order=order, mode="nearest")
+        plane = crop[..., c]
+        if wide > 1:
+            plane = ndimage.uniform_filter(plane, wide, mode="nearest")
+        plane = ndimage.map_coordinates(plane, at, order=order, mode="nearest")
         planes.append(plane.reshape(size, samples, size, samples).mean((1, 3)))
     return np.maximum(np.stack(planes, -1), 0).astype(np.float32)
 
@@ -170,8 +175,11 @@ def crop_mask(photo: Photo, rig: Rig, size: int) -> NDArray[np.bool_]:
     """(size, size): pixels of the sample's crop that a saturated photo pixel touches."""
     if not photo.clipped.any():
         return np.zeros((size, size), bool)
-    wide = ndimage.maximum_filter(photo.clipped, 3).astype(np.float32)
-    mask = np.broadcast_to(wide[..., None], (*wide.shape, 3))
+    corners = sample_corners(photo, rig).reshape(-1, 2)
+    x0, y0 = np.maximum(np.floor(corners.min(0)).astype(int) - 10, 0)
+    x1, y1 = np.ceil(corners.max(0)).astype(int) + 10
+    mask = np.zeros((*photo.clipped.shape, 3), np.float32)
+    mask[y0:y1, x0:x1] = ndimage.maximum_filter(photo.clipped[y0:y1, x0:x1], 3)[..., None]
     return crop_sample(Photo(mask), rig, size)[..., 0] > 0.05
 
 

@@ -18,10 +18,11 @@ from invrender.images import Photo
 from invrender.mirror import Ball
 from invrender.pattern import resize_pattern
 from invrender.rig import Rig
-from invrender.unfold import Mask, fill_environment, hidden_by_screen, unfold_environment
+from invrender.unfold import Mask, fill_environment, hidden_by_screen, unfold_environment, window
 
 Array = NDArray[np.floating[Any]]
 BLOCKS = 64  # across the photo; the table is compared as the means of these
+SIDE = 32  # pixels of a block that count, a side, at most about
 CELLS, ROWS = 16, 32  # of the screen, a side, and of the environment that is not clipped
 LAGS = (8, 16, 32)  # blocks between those that are compared
 # Logarithm of how many times brighter than the clipping level what is clipped is: mean, standard
@@ -39,8 +40,10 @@ def clipped_share(photo: Photo, rig: Rig, ball: Ball, height: int) -> Array:
     """(H, 2H, 3): the share of each texel of the environment whose channel is clipped."""
     if photo.clip_level is None:
         return np.zeros((height, 2 * height, 3), np.float32)
-    full = Photo((photo.image >= photo.clip_level).astype(np.float32))
-    share, _ = unfold_environment(full, rig, ball, height)
+    full = np.zeros(photo.image.shape, np.float32)
+    area = window(ball)
+    full[area] = photo.image[area] >= photo.clip_level
+    share, _ = unfold_environment(Photo(full), rig, ball, height)
     return np.asarray(share * np.asarray(rig.ball_reflectance), np.float32)
 
 
@@ -77,18 +80,21 @@ def _table(photo: Photo, rig: Rig, ball: Ball) -> tuple[Array, Array, Mask]:
 
     Sample, ball, its contact shadow and saturated blocks do not count.
     """
-    k = max(1, photo.width // BLOCKS)
-    h, w = photo.height // k, photo.width // k
+    step = max(1, photo.width // (BLOCKS * SIDE))
+    k = max(1, photo.width // (BLOCKS * step))
+    h, w = photo.height // (k * step), photo.width // (k * step)
 
     def cut(a: Any) -> Any:
-        return a[: h * k, : w * k].reshape(h, k, w, k, *a.shape[2:])
+        a = a[step // 2 :: step, step // 2 :: step][: h * k, : w * k]
+        return a.reshape(h, k, w, k, *a.shape[2:])
 
     mean = cut(photo.image).mean((1, 3))
-    centre = np.stack(np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5), -1) * k
+    block = k * step
+    centre = np.stack(np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5), -1) * block
     ray = rig.rays(centre, photo.height, photo.width)
     down = ray[..., 2] < -0.2
     points = rig.camera - ray * (rig.camera[2] / np.where(down, ray[..., 2], -1))[..., None]
-    block = k / rig.focal(photo.width) * rig.camera[2]
+    block = block / rig.focal(photo.width) * rig.camera[2]
     sample = (np.abs(points[..., :2]) < rig.sample_size / 2 + 1.5 * block).all(-1)
     distance = np.linalg.norm(points - np.asarray(ball.position), axis=-1)
     use = down & ~sample & (distance > 3 * ball.radius_m + block)

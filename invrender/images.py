@@ -8,7 +8,7 @@ import tempfile
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -90,7 +90,9 @@ def read_photo(path: Path) -> Photo:
     diagonals: tan(fov/2) = (43.27 mm / 2f) · width/diagonal.
     """
     photo = _read(Path(path), False)
-    return Photo(np.maximum(photo.image, 0), photo.clip_level, photo.fov, photo.exposure)
+    if photo.clip_level is None:  # float files may hold negative values
+        photo = replace(photo, image=np.maximum(photo.image, 0))
+    return photo
 
 
 def _read(path: Path, linear: bool) -> Photo:
@@ -117,16 +119,24 @@ def _read(path: Path, linear: bool) -> Photo:
         data = _upright(data, orientation)
         clip = None
         if data.dtype != np.float32:
-            levels = 256 if data.dtype == np.uint8 else 65536
-            table = (np.arange(levels) / (levels - 1)).astype(np.float32)
-            data = (table if linear else srgb_to_linear(table))[data]
             # JPEG rings around a saturated area: its pixels lie a little below white.
             clip = float(srgb_to_linear(np.array(250 / 255)))
-        image = np.asarray(data, np.float32)
-        photo = Photo(image, clip, *_lens(tags, *image.shape[:2]))
-    if not np.all(np.isfinite(photo.image)):
+            data = _decoded(data, linear)
+        photo = Photo(data, clip, *_lens(tags, *data.shape[:2]))
+    if photo.clip_level is None and not np.all(np.isfinite(photo.image)):
         raise InputError(f"{path} contains NaN or infinite pixels")
     return photo
+
+
+def _decoded(data: NDArray[Any], linear: bool) -> NDArray[np.float32]:
+    """Integers (H, W, 3) of 8 or 16 bits as linear values in [0, 1], row by row."""
+    levels = 256 if data.dtype == np.uint8 else 65536
+    table = (np.arange(levels) / (levels - 1)).astype(np.float32)
+    table = table if linear else srgb_to_linear(table)
+    image = np.empty(data.shape, np.float32)
+    for row, values in zip(image, data, strict=True):
+        np.take(table, values, out=row, mode="clip")  # the mode saves a copy
+    return image
 
 
 def check_size(path: Path, width: int, height: int) -> None:
