@@ -225,7 +225,7 @@ class _Lines:
             * (1 - t.inside)[..., None]
         )
         matrix = kernel @ hats
-        scale = np.median(t.seen, 1, keepdims=True) + 1e-3 * t.seen.mean()
+        scale = np.median(t.seen, 1, keepdims=True) + 1e-3 * t.seen.mean() + 1e-9
         right = (t.seen - (known * t.far * mirror) @ kernel.T) / scale
         weight = valid * (1.0 if weight is None else weight)
         weighted = (matrix * weight[..., None]).transpose(0, 2, 1)
