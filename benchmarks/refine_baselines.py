@@ -1,18 +1,22 @@
-"""The refinement's optimiser against others: map error against run time, from the same start.
+"""The refinement's optimisers against others: map error against run time, from the same start.
 
     python benchmarks/refine_baselines.py [--quick] --captures DIR --out DIR
 
-All minimise the same objective, Σ (photo - I)²/R + (θ - θ₀)ᵀΣ⁻¹(θ - θ₀) with the lobes' maps and
-prior as start, on the same photo and lights: per-pixel Gauss–Newton, Adam and L-BFGS with this
-package's estimator and Jacobian; Adam with Mitsuba's path replay (`prb`, two renders with seeds of
-their own a step); Adam with plain PyTorch's autograd through the same integral. Adam's step is
-relative to the prior's deviations, the `RATES` with the lowest cost for each. Times are the
-process's own seconds, without compilation and without measuring.
+All start at the network's maps, on the same photo and lights. Most minimise one objective,
+Σ (photo - I)²/R + (θ - θ₀)ᵀΣ⁻¹(θ - θ₀), with the network's prior, its deviations times the `SHARE`
+of the cautious step: per-pixel Gauss–Newton, Adam and L-BFGS with this package's estimator and
+Jacobian; Adam with Mitsuba's path replay (`prb`, two renders with seeds of their own a step); Adam
+with plain PyTorch's autograd through the same integral. Adam's step is relative to the prior's
+deviations. Beside them what `invrender refine` does, the learned correction with its cautious step,
+and the network's own weights adapted to the photo by Adam, without a prior. Each has the one of its
+rates that makes its own objective lowest; the truth chooses nothing. Times are the process's own
+seconds, without compilation and without measuring.
 """
 
 from __future__ import annotations
 
 import argparse
+import copy
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -20,7 +24,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from common import markdown, write_results
+from common import bar, markdown, write_results
 from forward_gradients import sample_sensor
 from matplotlib import pyplot as plt
 from scipy.optimize import minimize
@@ -28,18 +32,22 @@ from torch_forward import TorchScene
 
 from invrender import brdf  # noqa: F401  (Dr.Jit's back end before Mitsuba)
 from invrender.backend import dr
-from invrender.lobes import fit_lobes
 from invrender.maps import Maps, map_errors
 from invrender.materials import resize_maps
 from invrender.photograph import mi, sample_scene
 from invrender.pipeline import Seen, Stages, see
-from invrender.prior import Prior, lobe_prior, project, to_maps, to_theta
-from invrender.refine import PHOTO_NOISE, Shot, linearise, refine
+from invrender.prior import Prior, network_prior, project, to_maps, to_theta
+from invrender.refine import PHOTO_NOISE, SHARE, Shot, correct, linearise, refine
+from nets.clues import light_inputs
+from nets.infer import Corrector, Reconstructor
+from nets.loader import positions
 
 Array = Any
 Gradient = Callable[[Array, int], tuple[float, Array]]
-RATES = (0.03, 0.1, 0.3)
-NEAR = 1.1
+RATES = (0.1, 0.3)
+WEIGHT_RATES = (1e-5, 1e-4)  # of Adam on the network's weights
+LEAST = 0.02  # of a parameter's share: none has a prior of no width
+SAME = 1.001  # what counts as having reached an error
 SPP = 16  # of Mitsuba and PyTorch, a step
 
 
@@ -51,10 +59,21 @@ class Problem:
         assert self.seen.capture.truth is not None
         self.n, self.photo = n, self.seen.photo
         self.truth: Maps = resize_maps(self.seen.capture.truth, n, n)
-        self.shot = Shot(self.photo, self.seen.prepare())
-        self.prior: Prior = lobe_prior(fit_lobes(self.photo, self.shot.prepared))
+        clipped = self.seen.clipped if self.seen.clipped.any() else None
+        self.shot = Shot(self.photo, self.seen.prepare(), clipped)
+        lights = self.seen.lights
+        self.network = Reconstructor()
+        self.estimate = self.network(
+            self.photo, lights.rig, lights.pattern, lights.gain, lights.environment,
+            lights.pattern_captured,
+        )  # fmt: skip
+        full = network_prior(self.estimate.maps, self.estimate.sigma)
+        cautious = (full.sigma * np.maximum(SHARE, LEAST)).astype(np.float32)
+        self.prior = Prior(full.mean, cautious, full.correlation)
         mean = float(self.photo.mean())
         self.noise = (PHOTO_NOISE[0] * self.photo) ** 2 + (PHOTO_NOISE[1] * mean) ** 2
+        self.noise = np.where(self.seen.clipped[..., None], 1e12 * mean**2, self.noise)
+        self.noise = self.noise.astype(np.float32)
         self.precision = np.linalg.inv(self.prior.correlation)
 
     def theta(self, z: Array) -> Array:
@@ -95,7 +114,7 @@ def prb(problem: Problem) -> Gradient:
     params = mi.traverse(scene)
     names = ("diffuse", "specular", "roughness", "normal")
     keys = {name: next(k for k, _ in params if k.endswith(f".{name}")) for name in names}
-    sensor = sample_sensor(n)
+    sensor = sample_sensor(n, lights.rig)
     integrator = mi.load_dict({"type": "prb", "max_depth": 2})
 
     def run(z: Array, seed: int) -> tuple[float, Array]:
@@ -173,9 +192,10 @@ def adam(problem: Problem, gradient: Gradient, rate: float, seconds: float, limi
         m, v = 0.9 * m + 0.1 * g, 0.999 * v + 0.001 * g * g
         z = z - rate * (m / (1 - 0.9**i)) / (np.sqrt(v / (1 - 0.999**i)) + 1e-8)
         spent += time.process_time() - began
-        if i & (i - 1) == 0 or i % 16 == 0:
+        last = i == limit or spent > seconds
+        if last or i & (i - 1) == 0 or i % 16 == 0:
             curve.append(point(problem, z, spent))
-        if spent > seconds:
+        if last:
             break
     return curve
 
@@ -215,6 +235,58 @@ def gauss_newton(problem: Problem) -> Curve:
     return curve
 
 
+def chain(problem: Problem) -> Curve:
+    """The learned correction, then the cautious step."""
+    improve = Corrector()
+    curve = [point(problem, np.zeros_like(problem.prior.mean), 0.0)]
+    for _ in range(2):  # the first compiles
+        began = time.process_time()
+        e = improve(problem.photo, problem.shot.prepared, problem.estimate, problem.seen.clipped)
+        prior = network_prior(e.maps, e.sigma)
+        times = [time.process_time() - began]
+        result = correct([problem.shot], prior)
+        times.append(time.process_time() - began)
+    for theta, t in zip((prior.mean, to_theta(result.maps)), times, strict=True):
+        curve.append(point(problem, (theta - problem.prior.mean) / problem.prior.sigma, t))
+    return curve
+
+
+def adapt(problem: Problem, rate: float, seconds: float, limit: int) -> tuple[float, Curve]:
+    """Adam on the network's weights, for what its maps leave of the photo: the least, the curve."""
+    lights = problem.seen.lights
+    inputs = light_inputs(
+        lights.rig, lights.pattern, lights.gain, lights.environment, lights.pattern_captured
+    )
+    batch = {k: torch.from_numpy(v)[None] for k, v in inputs.items()}
+    batch["photo"] = torch.from_numpy(np.ascontiguousarray(problem.photo.transpose(2, 0, 1)))[None]
+    batch["position"] = positions(problem.n, problem.n)[None]
+    network = copy.deepcopy(problem.network.network).requires_grad_()
+    optimiser = torch.optim.Adam(network.parameters(), rate)
+    spent, least, curve = 0.0, np.inf, []
+    for i in range(limit + 1):
+        began = time.process_time()
+        out = network(batch)
+        slopes = out["normal"][:, :2] / out["normal"][:, 2:].clamp(min=0.1)
+        parts = [out["diffuse"], out["specular"], out["roughness"], slopes]
+        theta = torch.cat(parts, 1)[0].permute(1, 2, 0)
+        value = theta.detach().numpy()
+        image, jacobian = linearise(problem.shot.prepared, project(value.copy()), 64)
+        residual = problem.photo - image
+        least = min(least, float((residual**2 / problem.noise).sum()))
+        last = i == limit or spent > seconds
+        if last or i & (i - 1) == 0 or i % 8 == 0:
+            z = (value - problem.prior.mean) / problem.prior.sigma
+            curve.append(point(problem, z, spent))
+        if last:
+            break
+        gradient = -2 * np.einsum("hwcp,hwc->hwp", jacobian, residual / problem.noise)
+        optimiser.zero_grad()
+        theta.backward(torch.from_numpy((gradient / problem.n**2).astype(np.float32)))
+        optimiser.step()
+        spent += time.process_time() - began
+    return least, curve
+
+
 def reached(curve: Curve, column: int, level: float) -> float | None:
     """Seconds at which a curve first comes down to a level; None if it does not."""
     return next((p[0] for p in curve if p[column] <= level), None)
@@ -223,7 +295,13 @@ def reached(curve: Curve, column: int, level: float) -> float | None:
 def measure(folder: Path, n: int, seconds: float, limit: int) -> dict[str, Curve]:
     """Curves of all methods on a capture."""
     problem = Problem(folder, n)
-    curves = {"Gauss–Newton": gauss_newton(problem), "L-BFGS": lbfgs(problem, limit)}
+    curves = {
+        "Gauss–Newton": gauss_newton(problem),
+        "correction, cautious step": chain(problem),
+        "L-BFGS": lbfgs(problem, limit),
+    }
+    adapted = [adapt(problem, rate, seconds, limit) for rate in WEIGHT_RATES]
+    curves["network's weights"] = min(adapted, key=lambda a: a[0])[1]
     for name, gradient in (
         ("Adam, ours", ours(problem)),
         ("Adam, Mitsuba prb", prb(problem)),
@@ -234,46 +312,64 @@ def measure(folder: Path, n: int, seconds: float, limit: int) -> dict[str, Curve
     return curves
 
 
+def faster(curves: dict[str, Curve], method: str, baseline: str) -> float:
+    """By how much sooner a method is at the baseline's best map error; 0 if it never is."""
+    best = min(p[1] for p in curves[baseline])
+    theirs, ours = (reached(curves[k], 1, SAME * best) for k in (baseline, method))
+    assert theirs is not None
+    return 0.0 if ours is None else theirs / max(ours, 1e-9)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--captures", type=Path, required=True, help="of benchmarks/refine.py")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--quick", action="store_true", help="one capture at 16 × 16")
-    parser.add_argument("--count", type=int, default=2)
+    parser.add_argument("--count", type=int, default=4)
     parser.add_argument("--size", type=int, default=64)
-    parser.add_argument("--steps", type=int, default=128, help="at most, of the iterative methods")
-    parser.add_argument("--seconds", type=float, default=60.0, help="at most, a method and rate")
+    parser.add_argument("--steps", type=int, default=32, help="at most, of the iterative methods")
+    parser.add_argument("--seconds", type=float, default=10.0, help="at most, a method and rate")
     args = parser.parse_args()
     if args.quick:
-        args.count, args.size, args.steps, args.seconds = 1, 16, 4, 3.0
+        args.count, args.size, args.steps, args.seconds = 1, 16, 4, 1.0
     torch.set_num_threads(1)
     args.out.mkdir(parents=True, exist_ok=True)
     results: dict[str, dict[str, Curve]] = {}
     rows = []
     for folder in sorted(p for p in args.captures.iterdir() if p.is_dir())[: args.count]:
         curves = results[folder.name] = measure(folder, args.size, args.seconds, args.steps)
-        target = curves["Gauss–Newton"][-1][2]
         for name, curve in curves.items():
-            at = reached(curve, 2, NEAR * target)
-            low = min(p[1] for p in curve)
-            row = [folder.name, name, curve[0][1], low, reached(curve, 1, 1.001 * low)]
-            row += [min(p[2] for p in curve) / target, at or f"not in {curve[-1][0]:.1f}"]
-            rows.append(row)
-            print(*row, flush=True)
-    figure, axes = plt.subplots(1, len(results), figsize=(5 * len(results), 4), squeeze=False)
-    for axis, (capture, curves) in zip(axes[0], results.items(), strict=True):
+            best = min(p[1] for p in curve)
+            times = [reached(curve, 1, SAME * best), curve[-1][0]]
+            costs = [curve[0][2], min(p[2] for p in curve)]
+            rows.append([folder.name, name, curve[0][1], best, curve[-1][1], *times, *costs])
+            print(*rows[-1], flush=True)
+    bars = []
+    for baseline, least in (("Adam, Mitsuba prb", 30.0), ("Adam, PyTorch", 5.0)):
+        for method in ("Gauss–Newton", "correction, cautious step"):
+            ratio = float(np.median([faster(c, method, baseline) for c in results.values()]))
+            name = f"{method}: times faster than {baseline} to its best map error, median"
+            bars.append(bar(name, ratio, least, at_least=True))
+    figure, axes = plt.subplots(
+        2, len(results), figsize=(5 * len(results), 7), squeeze=False, sharex="col"
+    )
+    for column, (capture, curves) in zip(axes.T, results.items(), strict=True):
         for name, curve in curves.items():
-            t, e, _ = np.array(curve).T
-            axis.plot(np.maximum(t, 1e-3), e, marker=".", label=name)
-        axis.set(xscale="log", yscale="log", xlabel="processor seconds", title=capture)
+            t, *values = np.array(curve).T
+            for axis, y in zip(column, values, strict=True):
+                axis.plot(np.maximum(t, 1e-2), y, marker=".", label=name)
+                axis.set(xscale="log", yscale="log")
+        column[0].set_title(capture)
+        column[1].set_xlabel("processor seconds")
     axes[0, 0].set_ylabel("average map RMSE")
+    axes[1, 0].set_ylabel("cost a pixel")
     axes[0, 0].legend(fontsize=8)
     figure.tight_layout()
     figure.savefig(args.out / "refine_baselines.png", dpi=110)
-    header = ["capture", "method", "error at the start", "best error", "processor seconds to it"]
-    header += ["lowest cost over Gauss–Newton's last", f"seconds to {NEAR} times that"]
+    header = ["capture", "method", "map error at the start", "best", "at the end"]
+    header += ["processor seconds to the best", "in all", "cost a pixel at the start", "lowest"]
     (args.out / "refine_baselines.md").write_text(markdown(header, rows))
-    write_results(args.out, {"curves": results})
+    write_results(args.out, {"curves": results, "bars": bars})
 
 
 if __name__ == "__main__":

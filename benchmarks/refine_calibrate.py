@@ -1,0 +1,83 @@
+"""By how much errors exceed what is expected of them, once lights are estimated and not known.
+
+    python benchmarks/refine_calibrate.py [--quick] --out DIR --materials DIR --envs DIR
+
+Refines captures like those of `refine.py`, but none of its materials and rooms, from the photo
+alone: real ones that the networks have seen, and half as many procedural ones that they have not.
+For each map, the factor on its sigma with which 68% of the truth lies within, of all pixels and
+captures of a kind together, and the mean over both kinds: what `invrender.prior.UNTOLD` is to be
+multiplied by, again until it is one.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from common import markdown, write_results
+from numpy.typing import NDArray
+from refine_captures import arguments, make_captures
+
+from invrender.maps import NAMES
+from invrender.materials import resize_maps
+from invrender.pipeline import Stages, recover, see
+from invrender.results import deviations
+
+FIRST_SEEDS = {"real": 97_000, "made": 98_000}
+SURE = 0.6827  # of a Gaussian within one sigma
+STEP = 4  # every how many pixels count: errors are shared by neighbours
+
+
+def ratios(folder: Path, size: int) -> dict[str, NDArray[np.floating[Any]]]:
+    """|error|/sigma of some pixels of each map; of normals x and y, encoded."""
+    seen = see(folder, size, Stages())
+    _, result, _ = recover([seen], Stages())
+    assert seen.capture.truth is not None
+    found, true = result.maps.encoded(), resize_maps(seen.capture.truth, size, size).encoded()
+    out: dict[str, NDArray[np.floating[Any]]] = {}
+    for name, sigma in deviations(result.sigma).items():
+        error = np.abs(found[name] - true[name])
+        error = error[..., :2] if name == "normal" else error
+        sigma = sigma[..., None] if error.ndim > sigma.ndim else sigma
+        out[name] = (error / np.maximum(sigma, 1e-9))[::STEP, ::STEP].ravel()
+    return out
+
+
+def main() -> None:
+    parser = arguments(__doc__, "three small captures, under a minute", 16)
+    args = parser.parse_args()
+    count, size, width, spp = (2, 96, 480, 8) if args.quick else (args.count, 256, 960, 32)
+    kinds = {
+        "real": make_captures(
+            args.out / "real", count, size, width, spp, args.materials, args.envs,
+            FIRST_SEEDS["real"], trained=True,
+        ),
+        "made": make_captures(
+            args.out / "made", count // 2, size, width, spp, first=FIRST_SEEDS["made"]
+        ),
+    }  # fmt: skip
+    factors, covered = {}, {}
+    for kind, folders in kinds.items():
+        rows = []
+        for folder in folders:
+            rows.append(ratios(folder, size))
+            found = (f"{n} {np.quantile(r, SURE):.2f}" for n, r in rows[-1].items())
+            print(kind, folder.name, *found, flush=True)
+        every = {n: np.concatenate([r[n] for r in rows]) for n in NAMES}
+        factors[kind] = {n: float(np.quantile(r, SURE)) for n, r in every.items()}
+        covered[kind] = {n: float((r <= 1).mean()) for n, r in every.items()}
+    mean = {n: float(np.mean([f[n] for f in factors.values()])) for n in NAMES}
+    table = [
+        [n, *(c[n] for c in covered.values()), *(f[n] for f in factors.values()), mean[n]]
+        for n in NAMES
+    ]
+    header = ["map", *(f"within one sigma, {k}" for k in kinds), *(f"factor, {k}" for k in kinds)]
+    text = markdown([*header, "mean"], table)
+    (args.out / "refine_calibrate.md").write_text(text)
+    print(text)
+    write_results(args.out, {"factors": factors, "mean": mean, "within": covered})
+
+
+if __name__ == "__main__":
+    main()
