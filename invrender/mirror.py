@@ -106,8 +106,10 @@ def place_ball(rig: Rig, size: tuple[int, int], x: float, y: float, r: float) ->
     For a manual override, and for what detection finds. Raises `InputError` for a circle that is
     no ball or not whole in the photo.
     """
-    if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(r) and r > 0):
-        raise InputError(f"ball: need a centre and a positive radius in pixels, got {x}, {y}, {r}")
+    if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(r) and r >= 1):
+        raise InputError(
+            f"ball: need a centre and a radius of a pixel or more, got {x:g}, {y:g}, {r:g}"
+        )
     if not (r <= x <= size[1] - r and r <= y <= size[0] - r):
         raise InputError(
             f"ball: the circle {x:.0f}, {y:.0f}, {r:.0f} is not whole inside the "

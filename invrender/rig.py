@@ -23,6 +23,8 @@ from invrender.errors import InputError
 
 Array = NDArray[np.floating[Any]]
 Vec3 = tuple[float, float, float]
+LONGEST = 1e4  # of any length, in whatever unit
+_LENGTHS = ("_size", "_height", "_offset", "_radius", "_shift")
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,17 @@ class Rig:
             )
         if not self.camera_offset >= 0:
             raise InputError(f"rig: camera offset must not be negative, got {self.camera_offset:g}")
+        lengths = [getattr(self, f.name) for f in fields(self) if f.name.endswith(_LENGTHS)]
+        if any(np.abs(v).max() > LONGEST for v in lengths) or (
+            min(self.screen_size, self.screen_height, self.ball_radius) < 1 / LONGEST
+        ):
+            raise InputError(
+                f"rig: lengths must lie between {1 / LONGEST:g} and {LONGEST:g}; use metres"
+            )
+        if any(np.linalg.norm(t) > 180 for t in (self.screen_tilt, self.camera_tilt)):
+            raise InputError("rig: a tilt is at most 180 degrees")
+        if not self.camera[2] > 0:
+            raise InputError("rig: the camera must be above the table; see its shift")
         if not 1 <= self.fov <= 170:
             raise InputError(f"rig: fov must be between 1 and 170 degrees, got {self.fov:g}")
         if not all(0 < r <= 1 for r in self.ball_reflectance):
@@ -210,7 +223,7 @@ def read_rig(path: Path, *, fov: float | None = None) -> tuple[Rig, dict[str, st
     files: dict[str, str] = {}
     for section, entries in table.items():
         if not isinstance(entries, dict):
-            raise InputError(f"{path}: '{section}' must be a [section]")
+            raise InputError(f"{path}: {section!r} must be a [section]")
         for key, value in entries.items():
             if (section, key) in _FILES:
                 if not isinstance(value, str) or not value:
@@ -222,7 +235,7 @@ def read_rig(path: Path, *, fov: float | None = None) -> tuple[Rig, dict[str, st
             else:
                 known = sorted({k for s, k in [*_KEYS, *_FILES] if s == section})
                 hint = f"known keys: {', '.join(known)}" if known else "no such section"
-                raise InputError(f"{path}: unknown key '{key}' in [{section}] ({hint})")
+                raise InputError(f"{path}: unknown key {key!r} in section {section!r} ({hint})")
     for section, key in _REQUIRED:
         if _KEYS[section, key] not in values:
             raise InputError(f"{path}: [{section}] {key} is missing")
