@@ -274,6 +274,25 @@ def test_crop_shows_the_sample(size, tilt):
     assert np.sqrt(np.mean((crop - truth) ** 2)) < (0.012 if size == 32 else 0.004)
 
 
+@pytest.mark.parametrize("tilt", [(6.0, 0.0, 0.0), (0.0, -5.0, 0.0), (4.0, 4.0, 5.0)])
+def test_a_tilted_camera_gives_the_same_crop(tilt, folder):
+    """A homography, where ``rig.toml`` tells the tilt: 5 to 8 degrees, and a turn in the plane."""
+
+    def table(p):
+        x, y = p[..., 0] / RIG.sample_size, p[..., 1] / RIG.sample_size
+        return np.stack([0.5 + 0.4 * np.sin(25 * x), 0.5 + 0.4 * np.cos(19 * y), 0.5 + x * y], -1)
+
+    crops = []
+    for t in (tilt, (0.0, 0.0, 0.0)):
+        rig = replace(RIG, camera_tilt=t, fov=84.0)
+        write_exr(folder / "photo.exr", photograph(rig, *SIZE, table=table, ball=None))
+        write_rig(folder / "rig.toml", rig, "pattern.exr")
+        capture = load_capture(folder)
+        crops.append(crop_sample(capture.photo, capture.rig, 200))
+    assert np.sqrt(np.mean((crops[0] - crops[1]) ** 2)) < 0.003
+    assert np.abs(crops[0] - crops[1]).max() < 0.02
+
+
 def test_crop_does_not_alias():
     """Stripes finer than the crop's pixels average out."""
     photo = Photo(
