@@ -31,6 +31,7 @@ RADIUS_PRIOR = 0.10  # how far the ball's radius in pixels may be from what the 
 MIN_RADIUS = 10.0  # pixels; below this the pattern in the ball cannot be read
 SEARCH = 3.0  # how many radii from where the rig puts it the ball is looked for
 MIN_CONFIDENCE = 0.5
+SURE = 0.8  # confidence from which no other place is tried
 MIRROR_WEIGHT = 1.0
 OUTLINE_WEIGHT = 0.5  # of the outline beside the horizon: a mirror pales into the table there
 UNSURE = 0.0012  # deviation of the radius, relative, that takes half of `DOUBT` of the confidence
@@ -64,21 +65,23 @@ def find_ball(photo: Photo, rig: Rig, manual: tuple[float, float, float] | None 
         theta = _climb(view, rig, start, 2, 0.08, 25)
         starts.append((_score(view, rig, theta, 64, 1)[0], theta))
     starts.sort(key=lambda pair: -pair[0])
-    best, theta = -math.inf, np.zeros(3)
+    climbed = []
     for _, start in starts[:2]:
-        candidate = _climb(view, rig, _climb(view, rig, start, 1, 0.04, 40), 0, 0.02, 40)
-        score = _score(view, rig, candidate)[0]
-        if score > best:
-            best, theta = score, candidate
-    if best == -math.inf:
+        theta = _climb(view, rig, _climb(view, rig, start, 1, 0.04, 40), 0, 0.02, 40)
+        climbed.append((_score(view, rig, theta)[0], theta))
+    climbed.sort(key=lambda pair: -pair[0])
+    if not climbed:
         raise InputError("no mirror ball found: the photo shows nothing where the rig puts it")
-    found = make_ball(rig, np.array([theta[0], theta[1], 0.0]), theta[2], size)
-    fine = view_around(photo, np.asarray(found.centre), 3.3 * found.radius, found.radius / FINE)
-    rim = fit_rim(fine, rig, theta)
-    doubt = DOUBT / (1 + (UNSURE / max(rim.deviation, 1e-9)) ** 2)
-    confidence = _confidence(view, rim.rig, rim.theta) * (1 - doubt)
-    seen = make_ball(rim.rig, np.array([*rim.theta[:2], 0.0]), rim.theta[2], size)
-    ball = replace(place_ball(rig, size, *seen.centre, seen.radius), confidence=confidence)
+    best = climbed[0][1]
+    confidence, ball = 0.0, expected
+    # The others serve only where the best one leaves doubt.
+    others = [theta for _, theta in climbed[1:]]
+    for theta in (best, *others, best * [1, 1, 0.93], best * [1, 1, 1.07]):
+        sure, at = _settle(photo, view, rig, theta)
+        if sure > confidence:
+            confidence, ball = sure, at
+        if confidence > SURE:
+            break
     (x, y), r = ball.centre, ball.radius
     if confidence < MIN_CONFIDENCE:
         raise InputError(
@@ -89,6 +92,22 @@ def find_ball(photo: Photo, rig: Rig, manual: tuple[float, float, float] | None 
         raise InputError(f"the mirror ball at {x:.0f}, {y:.0f} is cut off by the edge of the photo")
     _check_exposure(photo, ball)
     return ball
+
+
+def _settle(photo: Photo, view: View, rig: Rig, theta: Array) -> tuple[float, Ball]:
+    """The ball near ``theta`` by its rim, and the confidence in it.
+
+    The ball is the one that the untilted camera would see like that.
+    """
+    size = (photo.height, photo.width)
+    found = make_ball(rig, np.array([theta[0], theta[1], 0.0]), theta[2], size)
+    fine = view_around(photo, np.asarray(found.centre), 3.3 * found.radius, found.radius / FINE)
+    rim = fit_rim(fine, rig, theta)
+    doubt = DOUBT / (1 + (UNSURE / max(rim.deviation, 1e-9)) ** 2)
+    confidence = _confidence(view, rim.rig, rim.theta) * (1 - doubt)
+    seen = make_ball(rim.rig, np.array([*rim.theta[:2], 0.0]), rim.theta[2], size)
+    ball = place_ball(rig, size, *seen.centre, seen.radius)
+    return confidence, replace(ball, confidence=confidence)
 
 
 def _check_exposure(photo: Photo, ball: Ball) -> None:

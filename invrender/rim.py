@@ -289,7 +289,7 @@ class _Lines:
             for _ in range(4):
                 damped = information + np.diag(np.diag(information)) * damping
                 step = -np.linalg.solve(damped, gradient)
-                step *= min(1, 8 / np.abs(step).max())
+                step *= min(1, 8 / max(np.abs(step).max(), 1e-12))
                 tried = self.solve(p + step @ self.units, spread, edge, fit.weight)
                 if tried.cost < fit.cost:
                     break
