@@ -48,7 +48,7 @@ ROBUST = 1.5  # spreads from which a residual counts less
 GUESS = 0.01  # of the radiance: its spread, before it is known
 FAITH = 0.004  # of the radiance: the least spread
 HORIZON = 0.5  # of a pixel: the least spread of the horizon's edge
-CORRELATED, EDGES_CORRELATED = 6.0, 5.0  # residuals side by side that tell the same
+CORRELATED, EDGES_CORRELATED = 12.0, 10.0  # residuals side by side that tell the same
 
 
 @dataclass(frozen=True)
