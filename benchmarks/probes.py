@@ -1,9 +1,9 @@
 """Real photographs that are no captures: none may be taken for one.
 
 `python benchmarks/probes.py DIR --out OUT`. DIR holds `index.csv` with a column `file`, and for
-photographs of mirror balls `ball_cx, ball_cy, ball_rx, ball_ry` in pixels. Such balls are whole, held
-before a room without table or screen, so that there is nothing right to find; they are tried with the
-default rig, and with one in which a ball would look as large as theirs, the most tempting one.
+photographs of mirror balls `ball_cx, ball_cy, ball_rx, ball_ry` in pixels. Such balls are whole,
+held before a room without table or screen, so that there is nothing right to find; they are tried
+with the default rig, and with one in which a ball would look as large as theirs.
 """
 
 from __future__ import annotations
