@@ -63,15 +63,16 @@ def fit_lobes(photo: Array, prepared: Tables | Unbiased, samples: int = 64) -> M
 
     rho = int(np.abs(ROUGHNESS - USUAL_ROUGHNESS).argmin())
     usual = Lobe(rho, np.full(3, USUAL_SPECULAR), np.ones(3))
-    whole = _fit(small, terms, np.ones((h, w), bool), usual)
+    moments = _moments(small, terms)
+    whole = _fit(moments, np.ones((h, w), bool), usual)
     # Groups of like albedo first; then each pixel joins the material that explains it best, with
     # its neighbours.
     label = _group(whole.diffuse(small, terms[whole.rho]))
     for _ in range(ROUNDS):
-        lobes = [_fit(small, terms, label == k, whole) for k in range(int(label.max()) + 1)]
+        lobes = [_fit(moments, label == k, whole) for k in range(int(label.max()) + 1)]
         label = _closest(small, [terms[f.rho] for f in lobes], lobes)
         label = np.unique(label, return_inverse=True)[1].reshape(h, w)
-    lobes = [_fit(small, terms, label == k, whole) for k in range(int(label.max()) + 1)]
+    lobes = [_fit(moments, label == k, whole) for k in range(int(label.max()) + 1)]
 
     # At full size each pixel chooses among the lobes anew.
     full = {
@@ -118,21 +119,34 @@ def _group(albedo: Array) -> Labels:
     return np.unique(label, return_inverse=True)[1].reshape(albedo.shape[:2])
 
 
-def _fit(photo: Array, terms: list[Any], of: NDArray[np.bool_], usual: Lobe) -> Lobe:
+def _moments(photo: Array, terms: list[Any]) -> Array:
+    """Weighted products xx, xy, yy, xz, yz, zz of x = E/π, y = B and z = photo - A.
+
+    For each ρ of the list, colour and pixel: (ρ, 3, 6, H·W). Their means are all that least squares
+    of any group of pixels needs.
+    """
+    weight = _weight(photo, photo).astype(np.float64)
+    out = np.empty((len(terms), 3, 6, photo[..., 0].size))
+    for i, (e, b, a) in enumerate(terms):
+        x, y, z = (np.moveaxis(weight * v, -1, 0).reshape(3, -1) for v in (e / np.pi, b, photo - a))
+        for k, product in enumerate((x * x, x * y, y * y, x * z, y * z, z * z)):
+            out[i, :, k] = product
+    return out
+
+
+def _fit(moments: Array, of: NDArray[np.bool_], usual: Lobe) -> Lobe:
     """The lobe of the pixels ``of``: as usual, of another f0, or bare metal."""
     measurements = MEASUREMENTS * float(of.mean())
-    pixels = photo[of].astype(np.float64)
-    weight = _weight(photo, pixels)
+    mean = moments @ (of.ravel() / of.sum())
     n = len(ROUGHNESS)
     residual, f0, albedo = np.zeros((3, n)), np.zeros((3, n, 3)), np.zeros((3, n, 3))
-    for i, (e, b, a) in enumerate(terms):
+    for i in range(n):
         for c in range(3):
-            w = weight[:, c]
-            x, y, z = w * e[of][:, c] / np.pi, w * b[of][:, c], w * (pixels[:, c] - a[of][:, c])
-            variance = _least_squares(x, y, z, 0.0, 0.0)[2]
+            variance = _least_squares(mean[i, c], 0.0, 0.0)[2]
             pulls = [variance / measurements / s**2 for s in SPREAD_F0]
-            fits = [_least_squares(x, y, z, pull, float(usual.f0[c])) for pull in pulls]
-            fits.append(_least_squares(0 * x, y, z, 0.0, 0.0))
+            fits = [_least_squares(mean[i, c], pull, float(usual.f0[c])) for pull in pulls]
+            metal = mean[i, c] * [0, 0, 1, 0, 1, 1]
+            fits.append(_least_squares(metal, 0.0, 0.0))
             for k in range(3):
                 f0[k, i, c], albedo[k, i, c] = fits[k][:2]
                 residual[k, i] += fits[k][2] / 3
@@ -150,16 +164,16 @@ def _weight(photo: Array, pixels: Array) -> Array:
     return 1 / np.sqrt(level * (pixels + 0.1 * level))
 
 
-def _least_squares(
-    x: Array, y: Array, z: Array, pull: float, usual: float
-) -> tuple[float, float, float]:
+def _least_squares(moments: Array, pull: float, usual: float) -> tuple[float, float, float]:
     """k_s from `LEAST_F0` and k_d in [0, 1] of z ≈ k_d·x + k_s·y, and the mean squared residual.
 
-    pull: weight of (k_s - usual)².
+    moments: the means of xx, xy, yy, xz, yz and zz. pull: weight of (k_s - usual)².
     """
-    xx, xy, xz = (x * x).mean() + 1e-20, (x * y).mean(), (x * z).mean()
-    yy, yz = (y * y).mean() + pull + 1e-20, (y * z).mean() + pull * usual
-    k_d = np.clip((yy * xz - xy * yz) / max(xx * yy - xy * xy, 1e-30), 0, 1)
-    k_s = float(np.clip((yz - xy * k_d) / yy, LEAST_F0, 1))
-    k_d = float(np.clip((xz - xy * k_s) / xx, 0, 1))
-    return k_s, k_d, float(((z - k_d * x - k_s * y) ** 2).mean())
+    xx, xy, yy, xz, yz, zz = (float(v) for v in moments)
+    x2, y2, y1 = xx + 1e-20, yy + pull + 1e-20, yz + pull * usual
+    k_d = np.clip((y2 * xz - xy * y1) / max(x2 * y2 - xy * xy, 1e-30), 0, 1)
+    k_s = float(np.clip((y1 - xy * k_d) / y2, LEAST_F0, 1))
+    k_d = float(np.clip((xz - xy * k_s) / x2, 0, 1))
+    rest = zz - 2 * k_d * xz - 2 * k_s * yz
+    rest += k_d * k_d * xx + 2 * k_d * k_s * xy + k_s * k_s * yy
+    return k_s, k_d, max(rest, 0.0)
