@@ -88,7 +88,7 @@ def find_ball(photo: Photo, rig: Rig, manual: tuple[float, float, float] | None 
             f"no mirror ball found (the best place, {x:.0f}, {y:.0f} with a radius of {r:.0f} "
             f"pixels, has a confidence of {confidence:.2f}): give it by hand as x, y, radius"
         )
-    if not (r <= x <= size[1] - r and r <= y <= size[0] - r):
+    if not _whole(ball):
         raise InputError(f"the mirror ball at {x:.0f}, {y:.0f} is cut off by the edge of the photo")
     _check_exposure(photo, ball)
     return ball
@@ -105,9 +105,15 @@ def _settle(photo: Photo, view: View, rig: Rig, theta: Array) -> tuple[float, Ba
     rim = fit_rim(fine, rig, theta)
     doubt = DOUBT / (1 + (UNSURE / max(rim.deviation, 1e-9)) ** 2)
     confidence = _confidence(view, rim.rig, rim.theta) * (1 - doubt)
-    seen = make_ball(rim.rig, np.array([*rim.theta[:2], 0.0]), rim.theta[2], size)
-    ball = place_ball(rig, size, *seen.centre, seen.radius)
+    ball = make_ball(rim.rig, np.array([*rim.theta[:2], 0.0]), rim.theta[2], size)
+    if _whole(ball):
+        ball = place_ball(rig, size, *ball.centre, ball.radius)
     return confidence, replace(ball, confidence=confidence)
+
+
+def _whole(ball: Ball) -> bool:
+    (x, y), r = ball.centre, ball.radius
+    return bool(r <= x <= ball.size[1] - r and r <= y <= ball.size[0] - r)
 
 
 def _check_exposure(photo: Photo, ball: Ball) -> None:
