@@ -23,7 +23,7 @@ from invrender.errors import InputError
 
 Array = NDArray[np.floating[Any]]
 Vec3 = tuple[float, float, float]
-LONGEST = 1e4  # of any length, in whatever unit
+LONGEST = 1e6  # of any length, in whatever unit
 _LENGTHS = ("_size", "_height", "_offset", "_radius", "_shift")
 
 
