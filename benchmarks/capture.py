@@ -11,7 +11,6 @@ irradiance from what the ball sees is told as well. Poses are told relative to t
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import math
 import statistics
@@ -25,16 +24,16 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 from common import bar, markdown, write_results
-from photos import Shot, make_shot
+from photos import Shot, arguments, make_shot
 from scipy.spatial.transform import Rotation
 
 from invrender.ball import find_ball
 from invrender.capture import Capture, extract_lights
-from invrender.environments import directions, resample_environment, solid_angles
+from invrender.environments import resample_environment
 from invrender.errors import InputError
 from invrender.mirror import make_ball
 from invrender.rig import Rig
-from invrender.unfold import hidden_by_screen
+from invrender.unfold import room_irradiance
 
 SEED = 1000  # photos from here on serve for nothing else
 SURE = 0.9  # confidence from which a wrong ball counts
@@ -75,7 +74,10 @@ def measure(shot: Shot, kind: str) -> dict[str, Any]:
     room[len(room) // 2 :] = 0
     seen = (lights.coverage > 0.5)[..., None]
     for name, part in (("irradiance", 1), ("irradiance seen", seen)):
-        e, t = room_light(lights.rig, lights.environment * part), room_light(shot.rig, room * part)
+        e, t = (
+            room_irradiance(rig, rig.sample_points(3, 3).reshape(-1, 3), light * part)
+            for rig, light in ((lights.rig, lights.environment), (shot.rig, room))
+        )
         row[name] = float(np.abs(e - t).mean() / t.mean())
     # Where a gamma is fitted the pattern's mean tells the light, whatever the curve.
     light, true = (
@@ -88,15 +90,6 @@ def measure(shot: Shot, kind: str) -> dict[str, Any]:
     row["shift, mm"] = 1000 * float(np.linalg.norm(found[0] - centre))
     row["tilt, deg"] = math.degrees((found[1] * turn.inv()).magnitude())
     return row
-
-
-def room_light(rig: Rig, environment: Any) -> Any:
-    """Irradiance (9, 3) of the room at nine points of the sample, with the screen in its way."""
-    height = len(environment)
-    ways = directions(height, 2 * height).reshape(-1, 3)
-    light = environment * (solid_angles(height, 2 * height)[:, None, None])
-    hidden = hidden_by_screen(rig, rig.sample_points(3, 3).reshape(-1, 3), ways)
-    return (~hidden * np.maximum(ways[:, 2], 0)) @ light.reshape(-1, 3)
 
 
 def screen_pose(rig: Rig, ball: Any) -> tuple[Any, Rotation]:
@@ -121,12 +114,7 @@ def big_photo() -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--quick", action="store_true", help="within a minute")
-    parser.add_argument("--count", type=int, default=60, help="photos with a ball (60)")
-    parser.add_argument("--rooms", type=Path, help="folder of equirectangular files, for half")
-    args = parser.parse_args()
+    args = arguments(__doc__, 60, "photos with a ball").parse_args()
     count = 9 if args.quick else args.count
     rows: list[dict[str, Any]] = []
     wrong: list[dict[str, Any]] = []

@@ -9,14 +9,13 @@ scale of its own: it is given that of the truth on the plane.
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from common import markdown, write_results
 from numpy.typing import NDArray
-from photos import Shot, make_shot
+from photos import Shot, arguments, make_shot
 from refine_captures import HOLDOUT
 from scipy import ndimage
 
@@ -100,12 +99,7 @@ def measure(shot: Shot) -> dict[str, Any] | None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--quick", action="store_true", help="within a minute")
-    parser.add_argument("--count", type=int, default=60, help="photos with clipped lamps (60)")
-    parser.add_argument("--rooms", type=Path, help="folder of equirectangular files, for half")
-    args = parser.parse_args()
+    args = arguments(__doc__, 60, "photos with clipped lamps").parse_args()
     prior = excess(args.rooms, 10 if args.quick else 60)
     print(
         "logarithm of the excess: mean {:.2f}, standard deviation {:.2f} ({} cases)".format(*prior)

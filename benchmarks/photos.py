@@ -7,6 +7,7 @@ an error in the package's unfolding shows.
 
 from __future__ import annotations
 
+import argparse
 import io
 from dataclasses import dataclass
 from functools import cache
@@ -19,14 +20,12 @@ from PIL import Image
 from scipy import ndimage
 
 from invrender.environments import (
-    directions,
     find_environments,
     procedural_environment,
     read_environment,
     resample_environment,
     rotate_environment,
     scale_environment,
-    solid_angles,
 )
 from invrender.images import Photo, linear_to_srgb, srgb_to_linear
 from invrender.maps import Maps
@@ -34,7 +33,7 @@ from invrender.materials import procedural_material, resize_maps
 from invrender.pattern import default_pattern
 from invrender.render import render
 from invrender.rig import Rig
-from invrender.unfold import hidden_by_screen
+from invrender.unfold import room_irradiance
 
 Array = NDArray[np.floating[Any]]
 Rng = np.random.Generator
@@ -61,6 +60,16 @@ class Shot:
     environment: Array
     maps: Maps
     sensor: str
+
+
+def arguments(doc: str | None, count: int, what: str) -> argparse.ArgumentParser:
+    """The command line of a benchmark on such photographs, ``count`` of them unless it says so."""
+    parser = argparse.ArgumentParser(description=doc)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--quick", action="store_true", help="within a minute")
+    parser.add_argument("--count", type=int, default=count, help=f"{what} ({count})")
+    parser.add_argument("--rooms", type=Path, help="folder of equirectangular files, for half")
+    return parser
 
 
 # --- what lies on the table ---------------------------------------------------------------------
@@ -159,12 +168,8 @@ def table_irradiance(rig: Rig, environment: Array, screen: Array, cells: int = 4
     p = np.stack(np.broadcast_arrays(x[None, :], -x[:, None], 0.0), -1)
     k = 12
     light = np.einsum("ijkl,klc->ijc", rig.screen_cosines(p, k), resize_mean(screen, k))
-    room = resample_environment(environment, 64)[:32].reshape(-1, 3)
-    d = directions(64, 128)[:32].reshape(-1, 3).astype(float)
-    weight = np.repeat(solid_angles(64, 128)[:32], 128) * d[:, 2]
-    for row, points in zip(light, p, strict=True):
-        row += ~hidden_by_screen(rig, points, d) @ (room * weight[:, None])
-    return np.asarray(light)
+    room = resample_environment(environment, 64)
+    return np.asarray(light + room_irradiance(rig, p.reshape(-1, 3), room).reshape(light.shape))
 
 
 def resize_mean(image: Array, k: int) -> Array:

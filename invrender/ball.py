@@ -20,7 +20,7 @@ from scipy import ndimage, optimize
 from invrender.ball_view import BLURS, TOE, View, curves, view_around
 from invrender.errors import InputError
 from invrender.images import Photo
-from invrender.mirror import Ball, make_ball, mirror_normals, on_table, place_ball
+from invrender.mirror import Ball, is_whole, make_ball, mirror_normals, on_table, place_ball
 from invrender.rig import Rig
 from invrender.rim import fit_rim
 
@@ -72,30 +72,28 @@ def find_ball(photo: Photo, rig: Rig, manual: tuple[float, float, float] | None 
     climbed.sort(key=lambda pair: -pair[0])
     if not climbed:
         raise InputError("no mirror ball found: the photo shows nothing where the rig puts it")
-    best = climbed[0][1]
-    confidence, ball = 0.0, expected
+    best, *others = (theta for _, theta in climbed)
+    balls = []
     # The others serve only where the best one leaves doubt.
-    others = [theta for _, theta in climbed[1:]]
     for theta in (best, *others, best * [1, 1, 0.93], best * [1, 1, 1.07]):
-        sure, at = _settle(photo, view, rig, theta)
-        if sure > confidence:
-            confidence, ball = sure, at
-        if confidence > SURE:
+        balls.append(_settle(photo, view, rig, theta))
+        if balls[-1].confidence > SURE:
             break
+    ball = max(balls, key=lambda b: b.confidence)
     (x, y), r = ball.centre, ball.radius
-    if confidence < MIN_CONFIDENCE:
+    if ball.confidence < MIN_CONFIDENCE:
         raise InputError(
             f"no mirror ball found (the best place, {x:.0f}, {y:.0f} with a radius of {r:.0f} "
-            f"pixels, has a confidence of {confidence:.2f}): give it by hand as x, y, radius"
+            f"pixels, has a confidence of {ball.confidence:.2f}): give it by hand as x, y, radius"
         )
-    if not _whole(ball):
+    if not is_whole(size, x, y, r):
         raise InputError(f"the mirror ball at {x:.0f}, {y:.0f} is cut off by the edge of the photo")
     _check_exposure(photo, ball)
     return ball
 
 
-def _settle(photo: Photo, view: View, rig: Rig, theta: Array) -> tuple[float, Ball]:
-    """The ball near ``theta`` by its rim, and the confidence in it.
+def _settle(photo: Photo, view: View, rig: Rig, theta: Array) -> Ball:
+    """The ball near ``theta`` by its rim, with the confidence in it.
 
     The ball is the one that the untilted camera would see like that.
     """
@@ -106,14 +104,9 @@ def _settle(photo: Photo, view: View, rig: Rig, theta: Array) -> tuple[float, Ba
     doubt = DOUBT / (1 + (UNSURE / max(rim.deviation, 1e-9)) ** 2)
     confidence = _confidence(view, rim.rig, rim.theta) * (1 - doubt)
     ball = make_ball(rim.rig, np.array([*rim.theta[:2], 0.0]), rim.theta[2], size)
-    if _whole(ball):
+    if is_whole(size, *ball.centre, ball.radius):
         ball = place_ball(rig, size, *ball.centre, ball.radius)
-    return confidence, replace(ball, confidence=confidence)
-
-
-def _whole(ball: Ball) -> bool:
-    (x, y), r = ball.centre, ball.radius
-    return bool(r <= x <= ball.size[1] - r and r <= y <= ball.size[0] - r)
+    return replace(ball, confidence=confidence)
 
 
 def _check_exposure(photo: Photo, ball: Ball) -> None:

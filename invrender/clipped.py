@@ -13,12 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from invrender.environments import directions, resample_environment, solid_angles
+from invrender.environments import resample_environment
 from invrender.images import Photo
 from invrender.mirror import Ball
 from invrender.pattern import resize_pattern
 from invrender.rig import Rig
-from invrender.unfold import Mask, fill_environment, hidden_by_screen, unfold_environment, window
+from invrender.unfold import (
+    Mask,
+    fill_environment,
+    room_irradiance,
+    unfold_environment,
+    window,
+)
 
 Array = NDArray[np.floating[Any]]
 BLOCKS = 64  # across the photo; the table is compared as the means of these
@@ -69,8 +75,8 @@ def raise_clipped(
     cells = resize_pattern(pattern, CELLS) * gain
     screen = np.einsum("nij,ijc->nc", rig.screen_cosines(at, CELLS), cells)
     room = resample_environment(fill_environment(environment, coverage), ROWS)
-    known = screen + _room(rig, at, room)
-    factor = np.exp(_excess(np.log(seen[use]), use, known, _room(rig, at, extra)))
+    known = screen + room_irradiance(rig, at, room)
+    factor = np.exp(_excess(np.log(seen[use]), use, known, room_irradiance(rig, at, extra)))
     raised = environment + extra * (factor - 1).astype(np.float32)
     return np.asarray(raised, np.float32), float(factor.mean())
 
@@ -100,21 +106,6 @@ def _table(photo: Photo, rig: Rig, ball: Ball) -> tuple[Array, Array, Mask]:
     use = down & ~sample & (distance > 3 * ball.radius_m + block)
     use &= ~cut(photo.clipped).any((1, 3)) & (mean.min(-1) > 0)
     return mean, points, use
-
-
-def _room(rig: Rig, points: Array, environment: Array) -> Array:
-    """Irradiance (n, 3) of the table at points (n, 3) from what the screen does not hide."""
-    height = len(environment)
-    half = height // 2
-    d = directions(height, 2 * height)[:half].reshape(-1, 3).astype(float)
-    weight = np.repeat(solid_angles(height, 2 * height)[:half], 2 * height) * d[:, 2]
-    flux = environment[:half].reshape(-1, 3) * weight[:, None]
-    lit = np.flatnonzero(flux.any(-1))
-    out = np.empty((len(points), 3))
-    step = max(1, 2_000_000 // max(len(lit), 1))
-    for i in range(0, len(points), step):
-        out[i : i + step] = ~hidden_by_screen(rig, points[i : i + step], d[lit]) @ flux[lit]
-    return out
 
 
 def _excess(seen: Array, use: Mask, known: Array, extra: Array) -> Array:

@@ -110,7 +110,7 @@ def place_ball(rig: Rig, size: tuple[int, int], x: float, y: float, r: float) ->
         raise InputError(
             f"ball: need a centre and a radius of a pixel or more, got {x:g}, {y:g}, {r:g}"
         )
-    if not (r <= x <= size[1] - r and r <= y <= size[0] - r):
+    if not is_whole(size, x, y, r):
         raise InputError(
             f"ball: the circle {x:.0f}, {y:.0f}, {r:.0f} is not whole inside the "
             f"{size[1]} × {size[0]} photo"
@@ -123,6 +123,11 @@ def place_ball(rig: Rig, size: tuple[int, int], x: float, y: float, r: float) ->
         at = rig.project(position, *size) + shift
         position = on_table(rig, size, float(at[0]), float(at[1]))
     return make_ball(rig, position, radius, size)
+
+
+def is_whole(size: tuple[int, int], x: float, y: float, r: float) -> bool:
+    """Whether a photo of ``size`` (H, W) holds the circle whole."""
+    return r <= x <= size[1] - r and r <= y <= size[0] - r
 
 
 def on_table(rig: Rig, size: tuple[int, int], x: float, y: float) -> Array:

@@ -24,6 +24,7 @@ from scipy import ndimage
 
 from invrender.ball_view import View, curves, edges
 from invrender.rig import Rig
+from invrender.unfold import sample_image
 
 Array = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]
@@ -71,8 +72,9 @@ def fit_rim(view: View, rig: Rig, theta: Array) -> Rim:
     distances from the horizon to the strongest edges near it.
     """
     p = np.array([*theta, 0.0, 0.0, math.log(USUAL_BLUR), 0.0])
+    light = _mend(view.image @ np.array(LUMA))
     for count, blur, limit, turns, scales in STAGES:
-        lines = _Lines(view, rig, p, count, blur, limit)
+        lines = _Lines(view, light, rig, p, count, blur, limit)
         starts = [p * [1, 1, k, 1, 1, 1, 1] for k in scales]
         spread, edge = np.min([lines.spreads(q) for q in starts], axis=0)
         found = [lines.descend(q, turns, spread, edge) for q in starts]
@@ -106,7 +108,7 @@ class _Trace:
 @dataclass(frozen=True)
 class _Fit:
     """A state of the fit: ``cost``, relative ``error`` and its robust ``weight`` (lines, samples),
-    and the ``trace`` that it was made from.
+    and the ``trace`` and ``horizon`` that it was made from.
 
     ``table``: (lines, nodes), over ``scale`` (lines, 1), the usual radiance; ``matrix`` (lines,
     samples, nodes) and ``solver``, its weighted pseudo-inverse.
@@ -116,6 +118,7 @@ class _Fit:
     error: Array
     weight: Array
     trace: _Trace
+    horizon: tuple[Array, Array, Array, Array]
     table: Array
     matrix: Array
     solver: Array
@@ -126,10 +129,9 @@ class _Lines:
     """The lines of one stage, from ``NEAREST`` radii to where the table is known."""
 
     def __init__(
-        self, view: View, rig: Rig, p: Array, count: int, blur: float, limit: float
+        self, view: View, light: Array, rig: Rig, p: Array, count: int, blur: float, limit: float
     ) -> None:
         self.view, self.rig, self.blur, self.limit = view, rig, blur, limit
-        light = _mend(view.image @ np.array(LUMA))
         self.light = ndimage.gaussian_filter(light, blur) if blur else light
         self.farther = ndimage.gaussian_filter(light, blur + 1)
         outline = curves(view, _tilted(rig, p), p, 2)[2]
@@ -189,14 +191,14 @@ class _Lines:
         outline = np.sqrt((outline * outline).sum(-1))[:, None]
         inside = np.clip((outline - self.points) * FINE + 0.5, 0, 1)
 
-        seen = _look(self.light, middle + self.samples[:, None] * line[:, None])
+        seen = sample_image(self.light, middle + self.samples[:, None] * line[:, None])
         beyond = (mirrored > self.limit) & (inside > 0)
         far, hidden = np.zeros(beyond.shape), np.zeros(beyond.shape, bool)
         reach = np.minimum(mirrored[beyond], FARTHEST) * radius
         place = view.at(centre + reach[:, None] * self.along[np.nonzero(beyond)[0]], rig)
         shown = (place > 0).all(-1) & (place < self.light.shape[::-1]).all(-1)
         hidden[beyond] = ~shown | (mirrored[beyond] > FARTHEST)
-        far[beyond] = _look(self.farther, place)
+        far[beyond] = sample_image(self.farther, place)
         return _Trace(mirrored, direct, inside, far, hidden, seen)
 
     def kernel(self, p: Array) -> Array:
@@ -237,10 +239,11 @@ class _Lines:
         # A sample that the photo leaves open costs what a usual one does.
         cost = float(np.log1p(np.where(valid, relative, 0.25)).sum()) * ROBUST**2 / CORRELATED
         cost += float(np.sum((table @ self.bend) * table)) / CORRELATED
-        *_, off, strength = self.horizon(p)
+        horizon = self.horizon(p)
+        *_, off, strength = horizon
         cost += float((strength * np.log1p((off / edge) ** 2)).sum()) / EDGES_CORRELATED
         cost += float(self.prior @ (self.off(p) ** 2))
-        return _Fit(cost, error, valid / (1 + relative), t, table, matrix, solver, scale)
+        return _Fit(cost, error, valid / (1 + relative), t, horizon, table, matrix, solver, scale)
 
     def residual(self, p: Array, t: _Trace, fit: _Fit) -> Array:
         """The photo along the lines less what it should be with the ball at ``p``, relative."""
@@ -271,7 +274,7 @@ class _Lines:
         """The usual residual of the lines with the ball at ``p``, and of the horizon's edge."""
         fit = self.solve(p, GUESS, 1.0, None)
         rest = np.abs(fit.error[fit.weight > 0])
-        off, strength = self.horizon(p)[2:]
+        *_, off, strength = fit.horizon
         strong = np.abs(off[strength > 0.1])
         edge = float(np.median(strong)) if strong.size else 0.0
         spread = float(np.median(rest)) if rest.size else 1.0
@@ -319,7 +322,7 @@ class _Lines:
         weighted = slope * (fit.weight.reshape(-1) / spread**2 / CORRELATED)
         matrix = self.units @ np.diag(self.prior) @ self.units.T + weighted @ slope.T
         gradient = self.units @ (self.prior * self.off(p)) + weighted @ fit.error.reshape(-1)
-        curve, normal, off, strength = self.horizon(p)
+        curve, normal, off, strength = fit.horizon
         slope = np.zeros((len(p), len(curve)))
         for k, unit in enumerate(self.units[:5]):
             moved = curves(self.view, _tilted(self.rig, p + unit), p + unit, len(curve))[0]
@@ -333,14 +336,3 @@ def _mend(image: Array) -> Array:
     usual = ndimage.median_filter(image, 3)
     off = np.abs(image - usual)
     return np.where(off > OUT * 1.48 * np.median(off), usual, image)
-
-
-def _look(image: Array, at: Array) -> Array:
-    """Bilinear look-ups in an image (h, w) at positions (..., 2), the border repeated."""
-    h, w = image.shape
-    x, y = np.clip(at[..., 0] - 0.5, 0, w - 1.001), np.clip(at[..., 1] - 0.5, 0, h - 1.001)
-    i, j = y.astype(int), x.astype(int)
-    fy, fx, k, flat = y - i, x - j, i * w + j, image.reshape(-1)
-    top = flat[k] * (1 - fx) + flat[k + 1] * fx
-    bottom = flat[k + w] * (1 - fx) + flat[k + w + 1] * fx
-    return np.asarray(top * (1 - fy) + bottom * fy)

@@ -281,13 +281,13 @@ class _Fit:
         deviation = np.hypot(max(a, 0.003) * shot, (1 - share)[..., None] * spread)
         return deviation, error / deviation
 
-    def rest(self, seen: NDArray[np.bool_]) -> Array:
+    def rest(self, seen: NDArray[np.bool_]) -> float:
         """Root mean square of what pixels differ by from the model, with Huber's weights."""
         if not seen.any():
-            return np.array(0.0)
+            return 0.0
         error = np.abs(self.error * self.scale)[seen]
         weight = np.minimum(1, 2 * np.median(error, 0) / np.maximum(error, 1e-12))
-        return np.asarray(np.sqrt(((weight * error**2).sum(0) / weight.sum(0)).mean()))
+        return float(np.sqrt(((weight * error**2).sum(0) / weight.sum(0)).mean()))
 
     def prior(self, u: Array) -> tuple[Array, Array]:
         """The prior's information (13, 13) and its gradient at ``u``."""
@@ -305,7 +305,7 @@ class _Fit:
         gamma, gain = np.exp(u[_GAMMA]), np.exp(u[_GAIN])
         inside = self.share > 0.98
         seen = inside & ~self.clipped.any(-1)
-        residual = float(self.rest(seen)) / float(gain.mean())
+        residual = self.rest(seen) / float(gain.mean())
         spread = np.zeros(6)
         if self.free[0]:
             spread = np.sqrt(np.diag(np.linalg.inv(self.information))[:6])

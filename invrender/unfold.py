@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import ndimage, sparse
 from scipy.sparse.linalg import spsolve
 
-from invrender.environments import directions
+from invrender.environments import directions, solid_angles
 from invrender.errors import InputError
 from invrender.images import Photo
 from invrender.mirror import Ball, mirror_normals
@@ -51,6 +51,22 @@ def hidden_by_screen(rig: Rig, points: Array, direction: Array) -> Mask:
         t = -(from_corner @ normal)[:, None] / (direction @ normal)
         a, b = along(e_x), along(e_y)
         return np.asarray((t > 0) & (a >= 0) & (a <= 1) & (b >= 0) & (b <= 1))
+
+
+def room_irradiance(rig: Rig, points: Array, environment: Array) -> Array:
+    """Irradiance (n, 3) of upward faces at points (n, 3) from the room (H, 2H, 3) that the screen
+    does not hide from them."""
+    height = len(environment)
+    half = height // 2
+    d = directions(height, 2 * height)[:half].reshape(-1, 3).astype(float)
+    weight = np.repeat(solid_angles(height, 2 * height)[:half], 2 * height) * d[:, 2]
+    flux = environment[:half].reshape(-1, 3) * weight[:, None]
+    lit = np.flatnonzero(flux.any(-1))
+    out = np.empty((len(points), 3))
+    step = max(1, 2_000_000 // max(len(lit), 1))
+    for i in range(0, len(points), step):
+        out[i : i + step] = ~hidden_by_screen(rig, points[i : i + step], d[lit]) @ flux[lit]
+    return out
 
 
 def trace_ball(rig: Rig, ball: Ball, pixels: Array) -> tuple[Array, Array, Mask]:
