@@ -48,7 +48,8 @@ class Options:
     procedural: share of made-up materials and rooms where folders are given. per_room: captures in
     the same room with the same rig. pattern: an image file, or the default pattern where empty.
     network: weights; where given, captures are not for that network but for the correction of its
-    maps (`nets.correction`).
+    maps (`nets.correction`). correction: weights of an earlier one; where given, each capture comes
+    twice, with the network's maps and with what that correction makes of them.
     """
 
     size: int = 128
@@ -62,6 +63,7 @@ class Options:
     env_height: int = 64
     pattern: str = ""
     network: str = ""
+    correction: str = ""
 
 
 @lru_cache(maxsize=2)

@@ -29,6 +29,7 @@ Array = NDArray[np.floating[Any]]
 
 WEIGHTS = Path(__file__).with_name("weights")
 TILE, OVERLAP = 1024, 64
+PASSES = 2  # of the correction
 
 
 @dataclass
@@ -94,9 +95,18 @@ class Corrector:
         clipped: NDArray[np.bool_] | None = None,
         samples: int = 64,
     ) -> Estimate:
-        """One step from an estimate towards what explains the photo (H, W, 3); ``clipped``: where
-        it is saturated. The forward model is evaluated for a band of rows at a time."""
+        """`PASSES` steps from an estimate towards what explains the photo (H, W, 3); ``clipped``:
+        where it is saturated."""
         lobes = fit_lobes(photo, prepared, samples)
+        for _ in range(PASSES):
+            estimate = self._step(photo, prepared, estimate, lobes, clipped, samples)
+        return estimate
+
+    def _step(
+        self, photo: Array, prepared: Tables | Unbiased, estimate: Estimate, lobes: Maps,
+        clipped: NDArray[np.bool_] | None, samples: int,
+    ) -> Estimate:  # fmt: skip
+        """One pass. The forward model is evaluated for a band of rows at a time."""
 
         @lru_cache(maxsize=1)
         def band(top: int, stop: int) -> Batch:

@@ -3,13 +3,16 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from invrender.errors import InputError  # noqa: E402
+from invrender.lobes import fit_lobes  # noqa: E402
 from invrender.maps import constant_maps  # noqa: E402
 from invrender.pattern import block_pattern  # noqa: E402
 from invrender.render import material_from_maps, prepare, radiance  # noqa: E402
 from invrender.rig import Rig  # noqa: E402
 from invrender.scene import make_scene, make_view  # noqa: E402
+from nets import data  # noqa: E402
 from nets.correction import ALBEDO_CORRELATION, INPUTS, NOISE, features, gauss_newton  # noqa: E402
-from nets.infer import Corrector, Estimate, linearised  # noqa: E402
+from nets.infer import PASSES, Corrector, Estimate, linearised  # noqa: E402
 from nets.loader import positions  # noqa: E402
 from nets.store import build, load_weights, save_weights  # noqa: E402
 
@@ -122,6 +125,44 @@ def test_nothing_but_numbers_leaves(value):
         out = network(b)
     for k, v in out.items():
         assert torch.isfinite(v).all(), k
+
+
+def test_a_second_pass_starts_where_the_first_ended(lit, tmp_path):
+    """In training captures and in use alike."""
+    correction = build("correction").eval()
+    with torch.no_grad():
+        correction.decoder.ending.weight.normal_(0, 0.05)
+    save_weights(tmp_path / "n.safetensors", build("tiny"), {})
+    save_weights(tmp_path / "c.safetensors", correction, {})
+    options = data.Options(
+        size=16, samples=8,
+        network=str(tmp_path / "n.safetensors"), correction=str(tmp_path / "c.safetensors"),
+    )  # fmt: skip
+    data.check_options(options)
+    stream = data.captures(options, 0)
+    first, second = next(stream), next(stream)
+    for k in ("photo", "lobes", "maps"):
+        np.testing.assert_array_equal(first[k], second[k])
+    batch = {k: torch.from_numpy(v.astype(np.float32))[None] for k, v in first.items()}
+    batch["position"] = positions(16, 16)[None]
+    with torch.inference_mode():
+        out = correction(batch)
+    np.testing.assert_allclose(second["theta"][:3], out["diffuse"][0], atol=5e-3)
+    np.testing.assert_allclose(second["sigma0"], out["sigma"][0], rtol=2e-2)
+    assert np.abs(second["theta"] - first["theta"].astype(float)).max() > 0.02
+
+    prepared, photo = lit
+    corrector = Corrector(tmp_path / "c.safetensors")
+    once = corrector._step(photo, prepared, guess(), fit_lobes(photo, prepared, 64), None, 64)
+    twice = corrector._step(photo, prepared, once, fit_lobes(photo, prepared, 64), None, 64)
+    assert PASSES == 2
+    got = corrector(photo, prepared, guess())
+    np.testing.assert_allclose(got.maps.diffuse, twice.maps.diffuse, atol=1e-6)
+
+
+def test_a_correction_needs_a_network():
+    with pytest.raises(InputError, match="give both"):
+        data.check_options(data.Options(correction="c.safetensors"))
 
 
 def test_weights_come_back(tmp_path):
