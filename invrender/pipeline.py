@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -137,11 +138,13 @@ def recover(
     *,
     init: str = "network",
     samples: int = 64,
+    keep: Path | None = None,
 ) -> tuple[Maps, Refined, list[Any]]:
     """Initial and refined maps of one sample from one or more photos, and the photos' lights.
 
     Several are solved jointly, in the first one's frame; the lights come back as the forward model
-    of each, prepared in that frame.
+    of each, prepared in that frame. keep: a folder for what the networks make of parts of large
+    images; what lies there is not computed again.
     """
     with stage("read"):
         networks = _networks() if init == "network" else None
@@ -150,8 +153,8 @@ def recover(
         from invrender.initial import flat_maps
         from invrender.joint import find_turn
         from invrender.lobes import fit_lobes
-        from invrender.prior import lobe_prior, network_prior, pooled
-        from invrender.refine import Shot, correct, refine
+        from invrender.prior import lobe_prior, network_prior, pooled, to_maps
+        from invrender.refine import Refined, Shot, correct, refine
 
         shots = [Shot(s.photo, s.prepare(), s.clipped if s.clipped.any() else None) for s in seen]
     if networks is None:
@@ -163,19 +166,23 @@ def recover(
         prior = lobe_prior(own[0])
     else:
         reconstruct, improve = networks
+
+        def told(name: str) -> Callable[[float], None]:
+            return lambda share: stage.progress(f"{name}: {share:.0%}")
+
         with stage("initial maps"):
             estimates = [
                 reconstruct(
                     s.photo, s.lights.rig, s.lights.pattern, s.lights.gain,
                     s.lights.environment if s.lights.environment.any() else None,
-                    s.lights.pattern_captured,
+                    s.lights.pattern_captured, told("initial maps"), keep,
                 )
                 for s in seen
             ]  # fmt: skip
         starts = [e.maps for e in estimates]
         with stage("refine"):
             estimates = [
-                improve(s.photo, s.prepared, e, s.clipped, samples)
+                improve(s.photo, s.prepared, e, s.clipped, samples, keep, told("refine"))
                 for s, e in zip(shots, estimates, strict=True)
             ]
         turns = [0] + [find_turn(m, starts[0]) for m in starts[1:]]
@@ -194,6 +201,9 @@ def recover(
                 shots, prior, samples=samples,
                 progress=lambda i, e: stage.progress(f"refine: step {i}, photo error {e:.4f}"),
             )  # fmt: skip
+        elif any(e.interrupted for e in estimates):
+            left = prior.sigma if prior.total is None else prior.total
+            result = Refined(to_maps(prior.mean), left, interrupted=True)
         else:
             result = correct(shots, prior, samples=samples)
     return starts[0], result, shots
@@ -227,7 +237,8 @@ def refine_capture(
     pictures are written. size: pixels a side of the maps. init: where refinement starts, "network"
     or "flat" (needs no torch). environment, gain: as for `see`. Raises `InputError` for bad input,
     before anything is written. Ctrl-C during the refinement writes the best maps so far, and is
-    raised again.
+    raised again; what the networks made of the parts of a large image stays beside ``out``, and
+    the same call goes on from there.
     """
     folders, out = [Path(folder), *map(Path, more)], Path(out)
     if size < 1:
@@ -236,7 +247,8 @@ def refine_capture(
         raise InputError(f"{out} is a file; choose a folder for the results")
     stage = Stages(progress)
     seen = [see(f, size, stage, ball=ball, environment=environment, gain=gain) for f in folders]
-    start, result, shots = recover(seen, stage, init=init, samples=samples)
+    unfinished = out.parent / f".{out.name}.unfinished"
+    start, result, shots = recover(seen, stage, init=init, samples=samples, keep=unfinished)
     first = seen[0]
     with stage("render"):
         from invrender.initial import baked_light
@@ -268,6 +280,7 @@ def refine_capture(
         write_results(out, report, first.lights, result, first.photo, pictures[1])
     if result.interrupted:
         raise KeyboardInterrupt(f"interrupted; {out} holds the best maps so far")
+    shutil.rmtree(unfinished, ignore_errors=True)
     return report
 
 

@@ -54,18 +54,20 @@ def network_prior(maps: Maps, sigma: dict[str, Array]) -> Prior:
     """The uncertainty of a network's maps, from what it expects of its errors, (H, W) a map.
 
     ``sigma`` of normals is that of n/2 + 1/2. An albedo's error within a material is at most a
-    share of it; the total error is `UNTOLD` times what the network expects.
+    share of it; the total error is `UNTOLD` times what the network expects, and no step is made
+    with more.
     """
     mean = to_theta(maps)
-    total = np.empty_like(mean)
-    total[..., D], total[..., S] = (sigma[k][..., None] for k in ("diffuse", "specular"))
-    total[..., R] = sigma["roughness"]
-    total[..., N] = 2 * sigma["normal"][..., None]
-    total = np.maximum(total, 1e-4)
-    spread = total.copy()
-    spread[..., D] = np.minimum(total[..., D], 0.01 + 0.15 * maps.diffuse)
-    spread[..., S] = np.minimum(total[..., S], 0.01 + 0.3 * maps.specular)
-    return Prior(mean, spread, _correlation(0.9, 0.95), UNTOLD * total)
+    told = np.empty_like(mean)
+    told[..., D], told[..., S] = (sigma[k][..., None] for k in ("diffuse", "specular"))
+    told[..., R] = sigma["roughness"]
+    told[..., N] = 2 * sigma["normal"][..., None]
+    told = np.maximum(told, 1e-4)
+    total = UNTOLD * told
+    spread = np.minimum(told, total)
+    spread[..., D] = np.minimum(spread[..., D], 0.01 + 0.15 * maps.diffuse)
+    spread[..., S] = np.minimum(spread[..., S], 0.01 + 0.3 * maps.specular)
+    return Prior(mean, spread, _correlation(0.9, 0.95), total)
 
 
 def _correlation(diffuse: float, specular: float) -> Array:

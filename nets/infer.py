@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from invrender.errors import InputError
@@ -37,12 +40,14 @@ class Estimate:
     """Maps, and for each the standard deviation (H, W) that the network expects of its error.
 
     Those of normals are of the encoded map, n/2 + 1/2; where the photo says nothing they are large.
-    unit: the radiance of a white plane under the capture's lights.
+    unit: the radiance of a white plane under the capture's lights. interrupted: by Ctrl-C, before
+    all passes of the correction were done.
     """
 
     maps: Maps
     sigma: dict[str, Array]
     unit: float
+    interrupted: bool = False
 
 
 class Reconstructor:
@@ -60,12 +65,14 @@ class Reconstructor:
         environment: Array | None = None,
         captured: Array | None = None,
         progress: Callable[[float], None] | None = None,
+        keep: Path | None = None,
     ) -> Estimate:
         """Maps of the sample from its photo (H, W, 3), linear radiance, row 0 at +y.
 
         pattern (P, P, 3) and gain (RGB): the screen's radiance; environment (H, 2H, 3) radiance in
         the photo's unit, whatever that is; captured: the screen's radiance as the ball shows it.
-        Pixels that are not finite count as black. ``progress`` is told the share done.
+        Pixels that are not finite count as black. ``progress`` is told the share done. keep: a
+        folder for the tiles of an image of several; those that lie there are not computed again.
         """
         photo = np.asarray(photo, np.float32)
         if photo.ndim != 3 or photo.shape[2] != 3 or 0 in photo.shape:
@@ -77,7 +84,8 @@ class Reconstructor:
         batch = {k: torch.from_numpy(v)[None] for k, v in lights.items()}
         batch["photo"] = torch.from_numpy(np.ascontiguousarray(photo.transpose(2, 0, 1)))[None]
         batch["position"] = positions(*photo.shape[:2])[None]
-        out = predict(self.network, batch, lambda x: report(0.3 + 0.7 * x))
+        kept = keep and keep / _digest(self.notes, photo, *lights.values())
+        out = predict(self.network, batch, partial(_told, report, 0.3, 0.7), kept)
         return estimate_of(out, white_level(lights))
 
 
@@ -94,17 +102,27 @@ class Corrector:
         estimate: Estimate,
         clipped: NDArray[np.bool_] | None = None,
         samples: int = 64,
+        keep: Path | None = None,
+        progress: Callable[[float], None] = lambda share: None,
     ) -> Estimate:
         """`PASSES` steps from an estimate towards what explains the photo (H, W, 3); ``clipped``:
-        where it is saturated."""
-        lobes = fit_lobes(photo, prepared, samples)
-        for _ in range(PASSES):
-            estimate = self._step(photo, prepared, estimate, lobes, clipped, samples)
+        where it is saturated. Ctrl-C ends it with what was found so far; keep: as for
+        `Reconstructor`. ``progress`` is told the share done."""
+        try:
+            lobes = fit_lobes(photo, prepared, samples)
+            for i in range(PASSES):
+                report = partial(_told, progress, i / PASSES, 1 / PASSES)
+                estimate = self._step(
+                    photo, prepared, estimate, lobes, clipped, samples, keep, report
+                )
+        except KeyboardInterrupt:
+            estimate = replace(estimate, interrupted=True)
         return estimate
 
     def _step(
         self, photo: Array, prepared: Tables | Unbiased, estimate: Estimate, lobes: Maps,
-        clipped: NDArray[np.bool_] | None, samples: int,
+        clipped: NDArray[np.bool_] | None, samples: int, keep: Path | None = None,
+        progress: Callable[[float], None] | None = None,
     ) -> Estimate:  # fmt: skip
         """One pass. The forward model is evaluated for a band of rows at a time."""
 
@@ -118,8 +136,23 @@ class Corrector:
         def cut(rows: slice, columns: slice) -> Batch:
             return {k: v[..., columns] for k, v in band(rows.start, rows.stop).items()}
 
-        out = predict_tiles(self.network, photo.shape[:2], cut)
+        known = (to_theta(estimate.maps), *estimate.sigma.values(), to_theta(lobes))
+        kept = keep and keep / _digest(self.notes, photo, *known)
+        out = predict_tiles(self.network, photo.shape[:2], cut, progress, kept)
         return estimate_of(out, estimate.unit)
+
+
+def _told(progress: Callable[[float], None], start: float, length: float, share: float) -> None:
+    """Tell the whole's progress the share done of one of its parts."""
+    progress(start + length * share)
+
+
+def _digest(notes: dict[str, Any], *arrays: Array) -> str:
+    """Of a network's notes and what it sees."""
+    digest = hashlib.sha256(json.dumps(notes, sort_keys=True).encode())
+    for array in arrays:
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()[:16]
 
 
 def linearised(
@@ -154,7 +187,10 @@ def linearised(
 
 
 def predict(
-    network: torch.nn.Module, batch: Batch, progress: Callable[[float], None] | None = None
+    network: torch.nn.Module,
+    batch: Batch,
+    progress: Callable[[float], None] | None = None,
+    keep: Path | None = None,
 ) -> Batch:
     """A network on a batch of any size, in overlapping tiles where it is large."""
 
@@ -163,7 +199,7 @@ def predict(
             k: v[..., rows, columns] if k in (*PIXELS, "position") else v for k, v in batch.items()
         }
 
-    return predict_tiles(network, batch["photo"].shape[-2:], cut, progress)
+    return predict_tiles(network, batch["photo"].shape[-2:], cut, progress, keep)
 
 
 @torch.inference_mode()
@@ -172,15 +208,26 @@ def predict_tiles(
     shape: Sequence[int],
     cut: Callable[[slice, slice], Batch],
     progress: Callable[[float], None] | None = None,
+    keep: Path | None = None,
 ) -> Batch:
     """A network's output (B, C, H, W), tile by tile; ``cut`` gives the batch of some rows and
-    columns. Tiles come in bands of rows."""
+    columns. Tiles come in bands of rows. Where there are several, each is kept in the folder
+    ``keep``, or read from there."""
     height, width = shape
     tiles = list(_tiles(height, width))
     sums: dict[str, Tensor] = {}
     total = torch.zeros(1, 1, height, width)
     for i, (rows, columns) in enumerate(tiles):
-        out = network(cut(rows, columns))
+        path = keep / f"{i}.safetensors" if keep and len(tiles) > 1 else None
+        if path and path.exists():
+            out = load_file(path)
+        else:
+            out = network(cut(rows, columns))
+            if path:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                part = path.with_suffix(".part")
+                save_file({k: v.contiguous() for k, v in out.items()}, part)
+                part.replace(path)
         if progress:
             progress((i + 1) / len(tiles))
         if len(tiles) == 1:

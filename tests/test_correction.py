@@ -1,17 +1,28 @@
+import json
+
 import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
 
+from invrender.cli import EXAMPLE  # noqa: E402
 from invrender.errors import InputError  # noqa: E402
 from invrender.lobes import fit_lobes  # noqa: E402
 from invrender.maps import constant_maps  # noqa: E402
 from invrender.pattern import block_pattern  # noqa: E402
+from invrender.pipeline import refine_capture  # noqa: E402
 from invrender.render import material_from_maps, prepare, radiance  # noqa: E402
 from invrender.rig import Rig  # noqa: E402
 from invrender.scene import make_scene, make_view  # noqa: E402
 from nets import data  # noqa: E402
-from nets.correction import ALBEDO_CORRELATION, INPUTS, NOISE, features, gauss_newton  # noqa: E402
+from nets.correction import (  # noqa: E402
+    ALBEDO_CORRELATION,
+    INPUTS,
+    NOISE,
+    Correction,
+    features,
+    gauss_newton,
+)
 from nets.infer import PASSES, Corrector, Estimate, linearised  # noqa: E402
 from nets.loader import positions  # noqa: E402
 from nets.store import build, load_weights, save_weights  # noqa: E402
@@ -163,6 +174,72 @@ def test_a_second_pass_starts_where_the_first_ended(lit, tmp_path):
 def test_a_correction_needs_a_network():
     with pytest.raises(InputError, match="give both"):
         data.check_options(data.Options(correction="c.safetensors"))
+
+
+def test_an_interrupted_correction_goes_on_where_it_stopped(lit, tmp_path, monkeypatch):
+    prepared, photo = lit
+    monkeypatch.setattr("nets.infer.TILE", 8)
+    monkeypatch.setattr("nets.infer.OVERLAP", 2)
+    corrector = Corrector.__new__(Corrector)
+    network, corrector.notes = build("correction").eval(), {}
+    with torch.no_grad():
+        network.decoder.ending.weight.normal_(0, 0.05)
+    corrector.network = network
+    whole = corrector(photo, prepared, guess())
+    calls = []
+
+    def stops(batch):
+        if len(calls) == 5:  # tiles; a pass has four
+            raise KeyboardInterrupt
+        calls.append(batch)
+        return network(batch)
+
+    corrector.network = stops
+    best = corrector(photo, prepared, guess(), keep=tmp_path)
+    assert best.interrupted and not whole.interrupted
+    once = corrector_pass(network, photo, prepared)
+    np.testing.assert_allclose(best.maps.diffuse, once.maps.diffuse, atol=1e-6)
+    calls.clear()
+    rest = corrector(photo, prepared, guess(), keep=tmp_path)
+    assert len(calls) == 3 and not rest.interrupted
+    np.testing.assert_allclose(rest.maps.diffuse, whole.maps.diffuse, atol=1e-6)
+    calls.clear()  # other photos have other tiles
+    assert corrector(1.1 * photo, prepared, guess(), keep=tmp_path).interrupted
+
+
+def corrector_pass(network, photo, prepared):
+    corrector = Corrector.__new__(Corrector)
+    corrector.network, corrector.notes = network, {}
+    return corrector._step(photo, prepared, guess(), fit_lobes(photo, prepared, 64), None, 64)
+
+
+def test_an_interrupted_run_leaves_the_best_and_goes_on(tmp_path, monkeypatch):
+    monkeypatch.setattr("nets.infer.TILE", 16)
+    monkeypatch.setattr("nets.infer.OVERLAP", 4)
+    forward, calls = Correction.forward, []
+
+    def stops(self, batch):
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        calls.append(batch)
+        return forward(self, batch)
+
+    monkeypatch.setattr(Correction, "forward", stops)
+    out, parts = tmp_path / "out", tmp_path / ".out.unfinished"
+    with pytest.raises(KeyboardInterrupt, match="best maps so far"):
+        refine_capture(EXAMPLE, out, size=24)
+    report = json.loads((out / "report.json").read_text())
+    assert "interrupted: these are the best maps so far" in report["warnings"]
+    assert report["map_error"]["initial"] == pytest.approx(report["map_error"]["refined"], rel=0.05)
+    assert len(list(parts.glob("*/*.safetensors"))) == 4 + 2  # the first network's tiles, and two
+    calls.clear()
+    monkeypatch.setattr(Correction, "forward", forward)
+    refine_capture(EXAMPLE, out, size=24)
+    assert not parts.exists()
+    again = json.loads((out / "report.json").read_text())
+    refine_capture(EXAMPLE, tmp_path / "fresh", size=24)
+    fresh = json.loads((tmp_path / "fresh" / "report.json").read_text())
+    assert again["map_error"]["refined"] == pytest.approx(fresh["map_error"]["refined"], rel=1e-4)
 
 
 def test_weights_come_back(tmp_path):
