@@ -1,22 +1,26 @@
-"""Stiff and extreme samples: how far the flat chain comes, and what it says of it.
+"""Stiff and extreme samples: how far refinement comes, and what it says of it.
 
     python benchmarks/refine_extremes.py [--quick] --out DIR
 
-Photos are rendered by the forward model from known maps and refined without a network, with the
-true lights unless the case says otherwise. A run warns where the photo is not explained to within
-`invrender.pipeline.POOR_FIT`, or where the albedo's colours follow the light's (`BAKED`).
+Photos are rendered by the forward model from known maps and refined from a flat start and from the
+networks' maps, with the true lights unless the case says otherwise. A run warns where the photo is
+not explained to within `invrender.pipeline.POOR_FIT`, or where the albedo's colours follow the
+light's (`BAKED`).
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import time
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from common import markdown, write_results
+from numpy.typing import NDArray
 
 from invrender.environments import procedural_environment, scale_environment
 from invrender.initial import baked_light, flat_maps
@@ -24,12 +28,14 @@ from invrender.lobes import fit_lobes
 from invrender.maps import Maps, constant_maps, map_errors
 from invrender.pattern import default_pattern
 from invrender.pipeline import BAKED, POOR_FIT
-from invrender.prior import lobe_prior
-from invrender.refine import Shot, refine
+from invrender.prior import lobe_prior, network_prior, project, to_theta
+from invrender.refine import Shot, correct, refine
 from invrender.render import make_scene, picture, prepare
 from invrender.rig import Rig
+from nets.infer import Corrector, Reconstructor
 
-RIG, GAIN = Rig(), 2.0
+Array = NDArray[np.floating[Any]]
+RIG, GAIN, PATTERN = Rig(), 2.0, default_pattern()
 
 
 @dataclass
@@ -78,45 +84,60 @@ def cases(n: int) -> dict[str, Case]:
     }
 
 
-def run(case: Case, seed: int) -> dict[str, Any]:
-    """Photograph a case and refine it."""
+def photograph(case: Case, seed: int) -> tuple[Array, NDArray[np.bool_] | None]:
+    """The case's photo (n, n, 3), and where it is saturated."""
     rng = np.random.default_rng(seed)
-    pattern = default_pattern()
-    true = prepare(make_scene(case.rig, pattern, case.environment, GAIN))
+    true = prepare(make_scene(case.rig, PATTERN, case.environment, GAIN))
     photo = picture(true, case.maps, 256)
     photo = np.maximum(photo * (1 + case.noise * rng.standard_normal(photo.shape)), 0)
     photo = photo.astype(np.float32)
-    clipped = None
-    if case.clip:
-        white = np.quantile(photo.max(-1), 1 - case.clip)
-        clipped = photo.max(-1) >= white
-        photo = np.minimum(photo, np.float32(white))
+    if not case.clip:
+        return photo, None
+    white = np.quantile(photo.max(-1), 1 - case.clip)
+    return np.minimum(photo, np.float32(white)), photo.max(-1) >= white
 
+
+@lru_cache(maxsize=1)
+def networks() -> tuple[Reconstructor, Corrector]:
+    return Reconstructor(), Corrector()
+
+
+def run(case: Case, seed: int, init: str) -> dict[str, Any]:
+    """Photograph a case and refine it."""
+    photo, clipped = photograph(case, seed)
     began = time.perf_counter()
-    prepared = prepare(make_scene(RIG, pattern, case.environment, GAIN))
-    start = flat_maps(photo, prepared)
-    lobes = fit_lobes(photo, prepared)
-    result = refine([Shot(photo, prepared, clipped)], lobe_prior(lobes))
+    prepared = prepare(make_scene(RIG, PATTERN, case.environment, GAIN))
+    shot = Shot(photo, prepared, clipped)
+    if init == "flat":
+        start = flat_maps(photo, prepared)
+        prior = lobe_prior(fit_lobes(photo, prepared))
+        result = refine([shot], prior)
+    else:
+        reconstruct, improve = networks()
+        estimate = reconstruct(photo, RIG, PATTERN, GAIN, case.environment)
+        start = estimate.maps
+        estimate = improve(photo, prepared, estimate, clipped)
+        prior = network_prior(estimate.maps, estimate.sigma)
+        result = correct([shot], prior)
     seconds = time.perf_counter() - began
     images = [*result.maps.encoded().values(), result.sigma]
     before, after = map_errors(start, case.maps), map_errors(result.maps, case.maps)
     baked = baked_light(result.maps.diffuse, prepared)
-    poor = result.history[-1]["photo_error"] > POOR_FIT["flat"]
-    kept = None
-    if clipped is not None:
-        same = np.abs(result.maps.diffuse - lobes.diffuse)[clipped].max()
-        kept = float(same)
+    seen = np.ones(photo.shape[:2], bool) if clipped is None else ~clipped
+    rest = (picture(prepared, result.maps, 256) - photo)[seen]
+    photo_error = float(np.sqrt(np.mean(rest**2)) / photo[seen].mean())
+    moved = np.abs(to_theta(result.maps) - project(prior.mean.copy())).max(-1)
     return {
         "initial": before,
         "refined": after,
-        "photo_error": result.history[-1]["photo_error"],
-        "iterations": len(result.history) - 1,
+        "photo_error": photo_error,
+        "iterations": max(len(result.history) - 1, 1),
         "converged": result.converged,
         "baked": baked,
-        "warns": not result.converged or poor or baked > BAKED,
+        "warns": not result.converged or photo_error > POOR_FIT[init] or baked > BAKED,
         "finite": bool(all(np.isfinite(i).all() for i in images)),
         "greatest albedo": float((result.maps.diffuse + result.maps.specular).max()),
-        "moved where clipped": kept,
+        "moved where clipped": float(moved[~seen].max()) if clipped is not None else None,
         "seconds": seconds,
     }
 
@@ -129,16 +150,26 @@ def main() -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     results: dict[str, Any] = {}
     rows = []
-    for seed, (name, case) in enumerate(cases(16 if args.quick else 64).items()):
-        r = results[name] = run(case, seed)
+    numbered = enumerate(cases(16 if args.quick else 64).items())
+    for (seed, (name, case)), init in itertools.product(numbered, ("flat", "network")):
+        r = results[f"{name}, {init}"] = run(case, seed, init)
         maps = [f"{r['initial'][n]:.3f} → {r['refined'][n]:.3f}" for n in r["initial"]]
         end = "yes" if r["converged"] else "no"
         end += ", warns" if r["warns"] else ""
-        row = [name, *maps, r["photo_error"], r["baked"], r["iterations"], end, r["seconds"]]
+        row = [name, init, *maps, r["photo_error"], r["baked"], r["iterations"], end, r["seconds"]]
         rows.append(row)
         print(*row, "" if r["finite"] else "NOT FINITE", flush=True)
     names = [*next(iter(results.values()))["initial"]]
-    header = ["case", *names, "photo error", "light in albedo", "steps", "converged", "seconds"]
+    header = [
+        "case",
+        "start",
+        *names,
+        "photo error",
+        "light in albedo",
+        "steps",
+        "converged",
+        "seconds",
+    ]
     (args.out / "refine_extremes.md").write_text(markdown(header, rows))
     write_results(args.out, {"cases": results})
 
