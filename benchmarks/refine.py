@@ -20,8 +20,9 @@ from refine_captures import arguments, make_captures
 
 from invrender.maps import NAMES, Maps, map_errors
 from invrender.materials import resize_maps
-from invrender.pipeline import Stages, recover, see
+from invrender.pipeline import POOR_FIT, Stages, coarse_error, recover, see
 from invrender.relight import rerender
+from invrender.render import picture
 from invrender.results import deviations
 
 INITS = ("network", "flat")
@@ -49,7 +50,7 @@ def measure(folder: Path, size: int, init: str) -> dict[str, Any]:
     stage = Stages()
     cpu = time.process_time()
     seen = see(folder, size, stage)
-    start, result, _ = recover([seen], stage, init=init)
+    start, result, shots = recover([seen], stage, init=init)
     cpu = time.process_time() - cpu
     assert seen.capture.truth is not None
     truth = resize_maps(seen.capture.truth, size, size)
@@ -64,7 +65,11 @@ def measure(folder: Path, size: int, init: str) -> dict[str, Any]:
         "coverage": shares,
         "covered": float(np.mean(list(shares.values()))),
         "converged": result.converged,
+        "coarse": coarse_error(
+            picture(shots[0].prepared, result.maps, 64), seen.photo, seen.clipped
+        ),
     }
+    row["warned"] = row["coarse"] > POOR_FIT[init]
     for when, maps in (("initial", start), ("refined", result.maps)):
         for name, error in map_errors(maps, truth).items():
             row[f"{name}_{when}"] = error
@@ -93,6 +98,7 @@ def summarise(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "errors": errors,
         "improved": float(np.mean(better)),
         "coverage": shares,
+        "warned": float(np.mean([r["warned"] for r in rows])),
         "seconds": {
             n: float(np.median([r[n] for r in rows]))
             for n in ("seconds_initial", "seconds_refined", "processor_seconds")

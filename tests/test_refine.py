@@ -13,7 +13,7 @@ from invrender.lobes import fit_lobes
 from invrender.maps import constant_maps, map_errors
 from invrender.materials import procedural_material, turn_maps
 from invrender.pattern import block_pattern
-from invrender.pipeline import BAKED
+from invrender.pipeline import BAKED, coarse_error
 from invrender.prior import (
     MIN_ROUGHNESS,
     Prior,
@@ -262,3 +262,16 @@ def test_albedo_that_makes_up_for_wrong_lights_is_told(prepared, environment):
     assert baked_light(dark.diffuse, prepared) == 0
     plain = prepare(make_scene(RIG, np.ones((4, 4, 3), np.float32), None, 1.0))
     assert baked_light(truth.diffuse, plain) == 0
+
+
+def test_coarse_error_sees_lights_and_not_texture():
+    photo = np.full((37, 50, 3), 0.5, np.float32)
+    nowhere = np.zeros(photo.shape[:2], bool)
+    assert coarse_error(1.2 * photo, photo, nowhere) == pytest.approx(0.2, rel=1e-4)
+    texture = np.random.default_rng(0).normal(0, 0.1, photo.shape).astype(np.float32)
+    assert coarse_error(photo + texture, photo, nowhere) < 0.1
+    left = np.where(np.arange(50)[None, :, None] < 25, 1.4, 1.0).astype(np.float32) * photo
+    assert coarse_error(left, photo, nowhere) == pytest.approx(0.4 / np.sqrt(2), rel=0.05)
+    assert coarse_error(left, photo, left[..., 0] > photo[..., 0]) == 0
+    assert coarse_error(photo[:1, :1], photo[:1, :1], nowhere[:1, :1]) == 0
+    assert np.isfinite(coarse_error(photo, 0 * photo, nowhere))
