@@ -20,6 +20,7 @@ from invrender.rig import Rig, read_rig
 from invrender.screen import SATURATED, fit_screen
 from invrender.unfold import (
     fill_environment,
+    lift_veil,
     pixel_grid,
     screen_coordinates,
     trace_ball,
@@ -216,6 +217,7 @@ def extract_lights(capture: Capture, ball: Ball, height: int = 128) -> Lights:
         raise InputError("the ball was found in a photo of another size")
     if height < 8 or height % 2:
         raise InputError(f"the environment needs an even height of 8 rows or more, got {height}")
+    photo = lift_veil(photo, rig, ball)
     screen = fit_screen(photo, rig, ball, capture.pattern)
     pattern, gain = screen.shown, screen.gain
     shift, tilt = (
@@ -237,7 +239,7 @@ def extract_lights(capture: Capture, ball: Ball, height: int = 128) -> Lights:
     ):
         raise not_the_pattern(ball)
     fit["room_saturated"] = _room_saturated(photo, rig, ball)
-    environment, coverage = unfold_environment(photo, rig, ball, height)
+    environment, coverage = unfold_environment(photo, rig, ball, height, blur=screen.blur)
     environment, fit["room_raised"] = raise_clipped(
         photo, rig, ball, pattern, gain, environment, coverage
     )

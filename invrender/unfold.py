@@ -7,11 +7,12 @@ direction. Nothing is taken as infinitely far or orthographic except the environ
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, sparse
+from scipy import ndimage, optimize, sparse
 from scipy.sparse.linalg import spsolve
 
 from invrender.environments import directions, solid_angles
@@ -22,7 +23,12 @@ from invrender.rig import Rig
 
 Array = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]
-SCREEN_MARGIN = 1.5  # pixels around the screen's image that may hold some of its light
+# Pixels around the screen's image that may hold some of its light, and how many more for each of
+# the camera's blur: the screen is often a hundred times as bright as the room beside it.
+SCREEN_MARGIN, BLURS = 1.5, 2.5
+# A veil over the ball is told from the table that is mirrored from 1.8 radii on.
+BARE = 1.8
+VEILED = 0.85  # what it must leave of the residuals' cost to be believed
 
 
 def screen_coordinates(rig: Rig, origin: Array, direction: Array) -> tuple[Array, Array, Mask]:
@@ -124,17 +130,70 @@ def screen_mask(rig: Rig, ball: Ball, margin: float) -> tuple[Array, tuple[slice
     return np.asarray(distance <= margin + 0.5, np.float32), area
 
 
+def lift_veil(photo: Photo, rig: Rig, ball: Ball) -> Photo:
+    """The photo without the glare that veils a part of the ball, if there is one.
+
+    Between horizon and outline the ball mirrors the table, which the photo shows as well: what it
+    shows more than that, over and over, is no image. That is fitted by a Gaussian in the photo with
+    a colour of its own (least squares with Cauchy's loss), and taken from the whole ball where it
+    explains the difference. A veil that ends before the horizon stays unseen.
+    """
+    area = rows, columns = window(ball)
+    pixels = pixel_grid(rows, columns)
+    point, mirrored, seen = trace_ball(rig, ball, pixels)
+    table = point - mirrored * (point[..., 2:] / np.minimum(mirrored[..., 2:], -1e-3))
+    at = rig.project(table, *ball.size)
+    far = np.linalg.norm((table - np.asarray(ball.position))[..., :2], axis=-1)
+    use = seen & (mirrored[..., 2] < -0.02) & (far > BARE * ball.radius_m)
+    use &= (at > 1).all(-1) & (at < np.array(ball.size[::-1]) - 1).all(-1)
+    # The sample may shine, and so look different from there.
+    use &= ~(np.abs(table[..., :2]) < 0.51 * rig.sample_size).all(-1) & ~photo.clipped[area]
+    mirror = np.asarray(rig.ball_reflectance)
+    extra = photo.image[area][use] - mirror * sample_image(photo.image, at[use])
+    spread = 1.48 * float(np.median(np.abs(extra))) if use.any() else 0.0
+    if not spread > 0:
+        return photo
+    inside, outside = ((p - ball.centre) / ball.radius for p in (pixels, at[use]))
+
+    def veil(p: Array, place: Array) -> Array:
+        return np.asarray(np.exp(-((place - p[:2]) ** 2).sum(-1) / p[2] ** 2)[..., None] * p[3:])
+
+    def off(p: Array) -> Array:
+        seen = veil(p, inside[use]) - mirror * veil(p, outside)
+        return np.asarray((seen - extra / spread).ravel())
+
+    def cost(p: Array) -> float:
+        return float(np.log1p(off(p) ** 2).sum())
+
+    starts = []
+    for angle in np.arange(12) * (math.pi / 6):
+        start = np.array([math.cos(angle), math.sin(angle), 0.4, 0, 0, 0])
+        near = ((inside[use] - start[:2]) ** 2).sum(-1) < 0.4**2
+        if near.any():
+            start[3:] = np.maximum(np.median(extra[near], 0) / spread, 0)
+            starts.append(start)
+    bounds = [-2, -2, 0.1, 0, 0, 0], [2, 2, 1, np.inf, np.inf, np.inf]
+    p = optimize.least_squares(off, min(starts, key=cost), bounds=bounds, loss="cauchy").x
+    if not cost(p) < VEILED * cost(np.array([0.0, 0, 1, 0, 0, 0])):
+        return photo
+    image = photo.image.copy()
+    lifted = np.maximum(image[area] - veil(p, inside) * spread, 0)
+    image[area] = np.where(photo.clipped[area][..., None], image[area], lifted)
+    return replace(photo, image=image)
+
+
 def unfold_environment(
-    photo: Photo, rig: Rig, ball: Ball, height: int = 128, samples: int = 4
+    photo: Photo, rig: Rig, ball: Ball, height: int = 128, samples: int = 4, blur: float = 0.0
 ) -> tuple[Array, Array]:
     """The environment as the ball shows it: radiance (H, 2H, 3) and coverage (H, 2H) in [0, 1].
 
     Each texel averages samples² directions; for each the point of the ball that mirrors it into
     the camera is found and the photo looked up there. Coverage is the share of a texel that is
     above the horizon and not behind the screen; radiance is the mean over that share. The mirror's
-    reflectance is divided out.
+    reflectance is divided out. ``blur``: the camera's, in pixels; as far as it spreads the screen's
+    light, the room beside it counts as hidden.
     """
-    mask, (rows, columns) = screen_mask(rig, ball, SCREEN_MARGIN)
+    mask, (rows, columns) = screen_mask(rig, ball, SCREEN_MARGIN + BLURS * blur)
     origin = (rows.start, columns.start)
     half = height // 2
     wanted = directions(samples * height, 2 * samples * height)[: half * samples].astype(float)
