@@ -1,9 +1,10 @@
 """Where the screen hangs and what it shows, read from its image in the mirror ball.
 
 The known pattern is registered with the ball's image: the screen's shift and tilt, the display's
-curve (a gamma a channel), its gain and the camera's blur are fitted together, by damped
-Gauss–Newton from coarse to fine. Each pixel is compared with what it should average of the pattern.
-Pixels on the screen's edge hold a share of the room beside it; the more, the less certain they are.
+curve (a gamma a channel), its gain and the camera's blur are fitted together, by Levenberg's and
+Marquardt's steps from coarse to fine. Each pixel is compared with what it should average of the
+pattern. Pixels on the screen's edge hold a share of the room beside it; the more, the less certain
+they are. An 8-bit file's colours are blurred more than its luma, by as much as fits.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import ndimage, special
 
 from invrender.errors import InputError
 from invrender.images import Photo
@@ -27,12 +28,17 @@ Array = NDArray[np.floating[Any]]
 SHIFT_PRIOR = 6e-3 / 0.09  # standard deviation of the screen's shift, in sizes of the sample
 TILT_PRIOR = 6.0  # of its tilt, degrees
 GAMMA_PRIOR, CHANNEL_PRIOR = 0.5, 0.03  # of log gamma, and of the channels' differences in it
+USUAL_BLUR, BLUR_PRIOR = 0.5, 0.7  # pixels; standard deviation of its logarithm
+COLOUR_BLUR = 0.9  # the same, of colours in a JPEG at half the resolution
+LUMA, CURVE = np.array([0.299, 0.587, 0.114]), 2.2  # a JPEG's, about
 FINEST = 100.0  # a ball of more pixels in radius is shrunk for the fit
 CELLS = 128  # of the pattern in the fit
 POOR = 0.01  # residual of the screen as it should be from which it is in doubt
-BETTER = 0.7  # of it, from which another pose or curve is believed
+WORTH = 50.0  # of half a chi-squared, by which another pose or curve must be likelier
 SATURATED = 0.01  # share of saturated pixels from which it is told, and the screen fitted with care
 NO_CURVE = 0.2  # share of saturated pixels from which gain and gamma cannot be told apart
+# Pixels of blur through which the screen is looked for, and what of the cost a step must gain.
+STAGES = ((2.5, 1e-3), (1.0, 1e-3), (0.0, 1e-3), (0.0, 1e-6))
 EDGE = 3  # pixels outside the screen's image that are compared as well
 
 
@@ -69,24 +75,70 @@ def fit_screen(photo: Photo, rig: Rig, ball: Ball, pattern: Array) -> Screen:
     `InputError` if the ball cannot show the screen, or shows it saturated or dark.
     """
     fit = _Fit(photo, rig, ball, pattern)
-    ideal = fit.result(fit.solve(fit.start(), 0.0, 6))
+    u = fit.start()
+    for stage in STAGES[2:]:
+        u = fit.solve(u, *stage)
+    ideal = fit.result(u)
     if ideal.residual < POOR and ideal.saturated < SATURATED:
         return ideal
-    fit.free[:] = True
+    fit.free[:_COLOUR] = True
     fit.free[_GAMMA] = ideal.saturated < NO_CURVE
-    u = fit.start()
-    for blur, turns in ((2.5, 8), (1.0, 8), (0.0, 14)):
-        u = fit.solve(u, blur * max(1.0, fit.radius / 60), turns)
+    start, u = u, fit.start()
+    for blurred, least in STAGES:
+        u = fit.solve(u, blurred * max(1.0, fit.radius / 60), least)
     moved = replace(fit.result(u), ideal_residual=ideal.residual)
     # A saturated pixel had at least so much light, which the ideal screen alone may not explain.
-    better = moved.residual < BETTER * ideal.residual or ideal.saturated > SATURATED
+    better = fit.cost(start) - fit.cost(u) > WORTH or ideal.saturated > SATURATED
     return moved if better else ideal
 
 
 # Places of the unknowns: shift and tilt in units of their priors, log gamma and log gain a channel,
-# blur in pixels.
-_SHIFT, _TILT, _GAMMA, _GAIN, _BLUR = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), 12
+# log blur in pixels, and log of what an 8-bit file's colours are blurred more.
+_SHIFT, _TILT, _GAMMA, _GAIN, _BLUR, _COLOUR = (
+    slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), 12, 13,
+)  # fmt: skip
+_COUNT = 14
 _STEP = 0.02  # of finite differences
+ROBUST = 2.5  # deviations from which an error counts less
+
+
+def _cover(s: Array) -> tuple[Array, Array]:
+    """Share of each sub-pixel (h, w, n, n) whose coordinate lies in [0, 1]; its derivative."""
+    across = np.abs(s[:, :, :, -1:] - s[:, :, :, :1]) + np.abs(s[:, :, -1:] - s[:, :, :1])
+    width = np.maximum(across / (s.shape[3] - 1), 1e-6)
+    cover = 0.5 + (0.5 - abs(s - 0.5)) / width
+    slope = np.where((cover > 0) & (cover < 1), -np.sign(s - 0.5) / width, 0)
+    return np.clip(cover, 0, 1), slope
+
+
+def _look_up(image: Array, s: Array, t: Array, slopes: bool) -> list[Array]:
+    """Bilinear look-ups (..., 3) in (n, n, 3), row 0 at t = 1; their derivatives by s and t."""
+    n = len(image)
+    x, y = (np.clip(q * n - 0.5, 0, n - 1.001) for q in (s, 1 - t))
+    i, j = y.astype(int), x.astype(int)
+    fy, fx = (y - i)[..., None], (x - j)[..., None]
+    flat, k = image.reshape(n * n, 3), i * n + j
+    corners = [flat[k + d] for d in (0, 1, n, n + 1)]
+    top, bottom = (a + fx * (b - a) for a, b in (corners[:2], corners[2:]))
+    out = [top + fy * (bottom - top)]
+    if slopes:
+        right = [b - a for a, b in (corners[:2], corners[2:])]
+        inside = [((q > 0) & (q < n - 1.001))[..., None] * n for q in (x, y)]
+        out += [(right[0] + fy * (right[1] - right[0])) * inside[0], (top - bottom) * inside[1]]
+    return out
+
+
+def _blur(image: Array, sigma: float) -> Array:
+    """Images (..., H, W, C) blurred by the discrete analogue of a Gaussian (Lindeberg 1990).
+
+    Its variance is right however small; a sampled Gaussian's is not below half a pixel.
+    """
+    radius = int(4 * sigma) + 2
+    kernel = special.ive(np.abs(np.arange(-radius, radius + 1)), sigma * sigma)
+    kernel /= kernel.sum()
+    for axis in (-3, -2):
+        image = ndimage.correlate1d(image, kernel, axis=axis, mode="nearest")
+    return image
 
 
 class _Fit:
@@ -94,26 +146,44 @@ class _Fit:
 
     def __init__(self, photo: Photo, rig: Rig, ball: Ball, pattern: Array) -> None:
         self.rig, self.full = rig, pattern
-        self.free = np.zeros(13, bool)
+        self.free = np.zeros(_COUNT, bool)
         self.free[_GAIN], self.free[_BLUR] = True, True
+        self.free[_COLOUR] = self.coded = photo.clip_level is not None
         self.step = step = max(1, round(ball.radius / FINEST))
         self.radius = ball.radius / step
-        self.samples = n = 4 if self.radius < 50 else 3 if self.radius < 80 else 2
+        n = 4 if self.radius < 50 else 3 if self.radius < 80 else 2
         rows, columns = self._area(rig, ball, step)
         area = photo.image[rows, columns]
         h, w = area.shape[0] // step, area.shape[1] // step
         pool = area[: h * step, : w * step].reshape(h, step, w, step, 3)
         reflectance = np.asarray(rig.ball_reflectance, np.float32)
-        self.image = pool.mean((1, 3)) / reflectance
+        self.observed = pool.mean((1, 3), dtype=float) / reflectance
         self.level = np.full(3, photo.clip_level or np.inf) / reflectance
-        self.clipped = pool.max((1, 3)) / reflectance >= self.level
-        y = rows.start + (np.arange(h * n) + 0.5) * step / n
-        x = columns.start + (np.arange(w * n) + 0.5) * step / n
-        pixels = np.stack(np.broadcast_arrays(x[None, :], y[:, None]), -1)
-        point, mirrored, seen = trace_ball(rig, ball, pixels)
-        self.point, self.mirrored, self.seen = point, mirrored, seen & (mirrored[..., 2] > 0.02)
-        self.pattern = np.maximum(resize_pattern(pattern, min(CELLS, len(pattern))), 1e-3)
-        self.blurred = 0.0
+        self.saturated = pool.max((1, 3)) / reflectance >= self.level
+        # Mirrored rays of the sub-pixels (h, w, n, n) as lines in space, moment and direction
+        # (Plücker): where one meets a plane is a fraction of linear forms in it.
+        at = (np.arange(n) + 0.5) * step / n
+        y = rows.start + step * np.arange(h)[:, None, None, None] + at[:, None]
+        x = columns.start + step * np.arange(w)[:, None, None] + at
+        point, mirrored, seen = trace_ball(rig, ball, np.stack(np.broadcast_arrays(x, y), -1))
+        self.lines = np.concatenate([np.cross(point, mirrored), mirrored], -1)
+        self.seen = seen & (mirrored[..., 2] > 0.02)
+        # Float64: descent is told from noise by the last digits.
+        coarse = resize_pattern(pattern, min(CELLS, len(pattern)))
+        self.pattern = np.maximum(coarse.astype(float), 1e-3)
+        self.usual = np.zeros(_COUNT)
+        self.usual[_BLUR], self.usual[_COLOUR] = np.log([USUAL_BLUR, COLOUR_BLUR / step])
+        self.prior = np.diag([*np.ones(6), *np.zeros(6), *np.full(2, 1 / BLUR_PRIOR**2)])
+        apart = np.eye(3) - 1 / 3
+        self.prior[_GAMMA, _GAMMA] = apart / CHANNEL_PRIOR**2 + 1 / 9 / GAMMA_PRIOR**2
+        self.focus(0.0)
+
+    def focus(self, blurred: float) -> None:
+        """Take the image ``blurred`` further for what follows."""
+        self.blurred, self.image, self.clipped = blurred, self.observed, self.saturated
+        if blurred:
+            self.image = ndimage.gaussian_filter(self.observed, (blurred, blurred, 0))
+            self.clipped = ndimage.maximum_filter(self.saturated, (3, 3, 1))
 
     @staticmethod
     def _area(rig: Rig, ball: Ball, step: int) -> tuple[slice, slice]:
@@ -146,50 +216,74 @@ class _Fit:
             screen_tilt=tuple(np.add(self.rig.screen_tilt, tilt)),
         )
 
-    def look(self, u: Array, *images: Array) -> tuple[Array, ...]:
-        """What the pixels average of images (n, n, C) on the screen, and the screen's share."""
-        s, t, _ = screen_coordinates(self.moved(u), self.point, self.mirrored)
-        n, count = self.samples, len(images[0])
-        ds, dt = (np.maximum(sum(np.abs(g) for g in np.gradient(a)), 1e-6) for a in (s, t))
-        cover = np.clip(0.5 + (0.5 - abs(s - 0.5)) / ds, 0, 1)
-        cover = cover * np.clip(0.5 + (0.5 - abs(t - 0.5)) / dt, 0, 1) * self.seen
-        on = cover > 0
-        x = np.clip(s[on] * count - 0.5, 0, count - 1.001)
-        y = np.clip((1 - t[on]) * count - 0.5, 0, count - 1.001)
-        i, j = y.astype(int), x.astype(int)
-        fy, fx = ((y - i)[:, None]).astype(np.float32), ((x - j)[:, None]).astype(np.float32)
-        weight = cover[on][:, None].astype(np.float32)
-        k = i * count + j
-        corners = (
-            (k, (1 - fx) * (1 - fy)), (k + 1, fx * (1 - fy)),
-            (k + count, (1 - fx) * fy), (k + count + 1, fx * fy),
-        )  # fmt: skip
-        flat = np.concatenate([image.reshape(count * count, -1) for image in images], 1)
-        values = np.zeros((*s.shape, flat.shape[1] + 1), np.float32)
-        values[on, :-1] = sum(flat[k] * f for k, f in corners) * weight
-        values[..., -1] = cover
-        h, w = s.shape[0] // n, s.shape[1] // n
-        out = np.zeros((h, w, values.shape[-1]), np.float32)
-        for a in range(n):
-            for b in range(n):
-                out += values[a::n, b::n] / np.float32(n * n)
-        sigma = math.hypot(max(float(u[_BLUR]), 0.0), self.blurred)
-        if sigma > 0.05:
-            out = ndimage.gaussian_filter(out, (sigma, sigma, 0), truncate=3)
-        ends = np.cumsum([image.shape[2] for image in images])
-        return (*np.split(out[..., :-1], ends[:-1], -1), out[..., -1])
+    def forms(self, u: Array) -> Array:
+        """(6, 3): a line times this, (a, b, c), meets the screen's plane at s = a/c, t = b/c."""
+        rig = self.moved(u)
+        (e_x, e_y), corner = rig.screen_edges, rig.screen_corner
+        a = np.concatenate([-e_y, np.cross(e_y, corner)])
+        b = np.concatenate([e_x, np.cross(corner, e_x)])
+        return np.stack([a, b, np.concatenate([np.zeros(3), np.cross(e_x, e_y)])], -1)
+
+    def look(self, u: Array, slopes: bool = False) -> Array:
+        """What the pixels average of the screen's pattern, and the screen's share: (1, H, W, 4).
+
+        With ``slopes`` their derivatives too, (9, H, W, 4): by shift and tilt, by log gamma, each
+        channel's by its own, and by blur.
+        """
+        forms = self.forms(u)
+        a, b, c = np.moveaxis(self.lines @ forms, -1, 0)
+        front = self.seen & (c > 0)
+        c = np.where(front, c, 1)
+        s, t = a / c, b / c
+        cover_s, edge_s = _cover(s)
+        cover_t, edge_t = _cover(t)
+        cover_s *= front
+        on = (cover_s * cover_t > 0).any((2, 3))
+        s, t, c, cover_s, cover_t = (q[on] for q in (s, t, c, cover_s, cover_t))
+        cover = (cover_s * cover_t)[..., None]
+        gamma = np.exp(u[_GAMMA])
+        shown = self.pattern**gamma
+        light, *by_place = _look_up(shown, s, t, slopes)
+        parts = [np.concatenate([light * cover, cover], -1)]
+        if slopes:
+            edges = edge_s[on] * cover_t, edge_t[on] * cover_s
+            by_s, by_t = (
+                np.concatenate([d * cover + light * e[..., None], e[..., None]], -1)
+                for d, e in zip(by_place, edges, strict=True)
+            )
+            lines = self.lines[on]
+            for k in range(6 if self.free[0] else 0):
+                moved = u.copy()
+                moved[k] += _STEP
+                da, db, dc = np.moveaxis(lines @ ((self.forms(moved) - forms) / _STEP), -1, 0)
+                ds, dt = (((d - q * dc) / c)[..., None] for d, q in ((da, s), (db, t)))
+                parts.append(by_s * ds + by_t * dt)
+            (curve,) = _look_up(shown * np.log(self.pattern) * gamma, s, t, False)
+            parts.append(np.concatenate([curve * cover, 0 * cover], -1))
+        out = np.zeros((len(parts), *on.shape, 4))
+        for part, image in zip(parts, out, strict=True):
+            image[on] = part.mean((1, 2))
+        return self.blur(out, u, slopes)
+
+    def blur(self, out: Array, u: Array, slope: bool) -> Array:
+        """Images (n, H, W, 4) blurred as the camera does; last, if asked for, the slope by that."""
+        sigma, wider = (math.hypot(math.exp(u[_BLUR] + d), self.blurred) for d in (0, _STEP))
+        blurred = _blur(out, sigma)
+        if not slope:
+            return np.asarray(blurred)
+        more = _blur(out[:1], wider)
+        return np.concatenate([blurred, (more - blurred[:1]) / _STEP])
 
     def start(self) -> Array:
         """The nominal pose, a straight curve and the gain that fits them best."""
-        u = np.zeros(13)
-        u[_BLUR] = 0.5
-        shown, share = self.look(u, self.pattern)
-        inside = share > 0.98
+        u = self.usual.copy()
+        seen = self.look(u)[0]
+        inside = seen[..., 3] > 0.98
         if inside.sum() < 12:
             raise InputError(
                 "the ball's image shows too little of the screen: check the rig's sizes"
             )
-        light = self.image[inside].mean(0) / shown[inside].mean(0)
+        light = self.image[inside].mean(0) / seen[inside].mean(0)[:3]
         if not (light > 0).all():
             raise InputError("the screen is dark in the ball's image: is the pattern displayed?")
         u[_GAIN] = np.log(light)
@@ -211,117 +305,149 @@ class _Fit:
         y, x = ndimage.distance_transform_edt(~room, return_distances=False, return_indices=True)
         return image[y, x], spread[y, x]
 
-    def solve(self, u: Array, blurred: float, turns: int) -> Array:
-        """Damped Gauss–Newton steps from ``u`` on images that are ``blurred`` further."""
-        self.blurred = blurred
-        image = (
-            ndimage.gaussian_filter(self.image, (blurred, blurred, 0)) if blurred else self.image
-        )
-        clipped = self.clipped
-        if blurred:
-            clipped = ndimage.maximum_filter(clipped, (3, 3, 1))
-        damping = 1e-2
-        free = self.free
-        for _ in range(turns):
-            shown = self.pattern ** np.exp(u[_GAMMA]).astype(np.float32)
-            slope = shown * np.log(self.pattern) * np.exp(u[_GAMMA]).astype(np.float32)
-            p, dp, share = self.look(u, shown, slope)
-            gain = np.exp(u[_GAIN]).astype(np.float32)
-            room, spread = self.background(image, share)
-            use = ndimage.distance_transform_edt(share < 0.003) <= EDGE
-            deviation, error = self.errors(image, clipped, p * gain, share, room, spread, gain)
-            self.error, self.share, self.scale = error, share, deviation
+    def solve(self, u: Array, blurred: float, least: float) -> Array:
+        """The fit from ``u`` on to the image ``blurred`` further (Levenberg and Marquardt).
 
-            def columns(step: float, part: Array, other: Array) -> Array:
-                out = (part - p) * gain - (other - share)[..., None] * room  # noqa: B023
-                return np.asarray(out[use] / deviation[use] / step)  # noqa: B023
-
-            jacobian = np.zeros((int(use.sum()), 3, 13), np.float32)
-            for k in [*range(6), _BLUR]:
-                if free[k]:
-                    moved = u.copy()
-                    moved[k] += _STEP if k < 6 else 0.1
-                    jacobian[..., k] = columns(moved[k] - u[k], *self.look(moved, shown))
-            for c in range(3):
-                jacobian[:, c, 6 + c] = (dp * gain / deviation)[use][:, c]
-                jacobian[:, c, 9 + c] = (p * gain / deviation)[use][:, c]
-            r = error[use]
-            # Saturated pixels say only that there is at least so much light.
-            jacobian[clipped[use] & (r == 0)] = 0
-            weight = 1 / (1 + (r / 2.5) ** 2)
-            j = jacobian.reshape(-1, 13)[:, free]
-            wj = j * weight.reshape(-1, 1)
-            prior, pull = self.prior(u)
-            matrix = (j.T @ wj + prior[np.ix_(free, free)]).astype(float)
-            right = (wj.T @ r.reshape(-1) - pull[free]).astype(float)
-            matrix[np.diag_indices_from(matrix)] *= 1 + damping
-            delta = np.zeros(13)
-            delta[free] = np.linalg.solve(matrix, right)
-            delta *= min(1, 0.5 / max(np.abs(delta).max(), 1e-12))
-            u = u + delta
-            u[_BLUR] = np.clip(u[_BLUR], 0, 3)
-            self.information = matrix
-            if np.abs(delta).max() < (0.01 if blurred else 2e-3):
+        A step that gains ``least`` of the cost or less is the last one. What is not fitted, the
+        errors' deviations and the room behind the screen, is as ``u`` has it.
+        """
+        self.focus(blurred)
+        self.suppose(u)
+        cost = self.cost(u)
+        damping = 1e-3
+        for _ in range(60):
+            matrix, right = self.normal_equations(u)
+            eased = damping / 8
+            for _ in range(6):
+                damped = matrix + np.diag(np.diag(matrix) * damping + 1e-9)
+                step = np.zeros(_COUNT)
+                step[self.free] = np.linalg.solve(damped, right)
+                step *= min(1, 0.5 / max(np.abs(step).max(), 1e-12))
+                tried = u + step
+                gained = cost - self.cost(tried)
+                if gained > 0:
+                    break
+                damping *= 8
+                eased = damping
+            else:
+                break
+            u, cost, damping = tried, cost - gained, eased
+            if gained < least * cost:
                 break
         return u
 
-    def errors(
-        self, image: Array, clipped: NDArray[np.bool_], light: Array, share: Array, room: Array,
-        spread: Array, gain: Array,
-    ) -> tuple[Array, Array]:  # fmt: skip
-        """The pixels' expected deviation, and their errors over it (H, W, 3), observed - model."""
-        model = light + (1 - share)[..., None] * room
-        error = image - model
-        error = np.where(clipped, np.maximum(self.level - model, 0), error)
+    def suppose(self, u: Array) -> None:
+        """The room behind the screen, the pixels to compare and what to expect of their errors, for
+        the screen at ``u``."""
+        seen = self.look(u)[0]
+        share = seen[..., 3]
+        self.room, spread = self.background(self.image, share)
+        self.use = ndimage.distance_transform_edt(share < 0.003) <= EDGE
+        self.deviation = 1.0
+        error = np.abs(self.errors(u, seen))
+        gain = np.exp(u[_GAIN])
         level = float(gain.mean())
+        model = seen[..., :3] * gain + (1 - share)[..., None] * self.room
         shot = np.sqrt(level * (model + 0.02 * level))
-        inside = (share > 0.98)[..., None] & ~clipped
-        relative = np.abs(error / shot)[inside]
+        inside = (share > 0.98)[..., None] & ~self.clipped
+        relative = (error / shot)[inside]
         a = 1.48 * float(np.median(relative)) if relative.size else 0.1
-        deviation = np.hypot(max(a, 0.003) * shot, (1 - share)[..., None] * spread)
-        return deviation, error / deviation
+        self.deviation = np.hypot(max(a, 0.003) * shot, (1 - share)[..., None] * spread)
 
-    def rest(self, seen: NDArray[np.bool_]) -> float:
-        """Root mean square of what pixels differ by from the model, with Huber's weights."""
-        if not seen.any():
+    def errors(self, u: Array, seen: Array) -> Array:
+        """Observed less expected (H, W, 3), in deviations, where the pixels have ``seen`` that.
+
+        A saturated pixel says only that there is at least so much light.
+        """
+        error = self.image - self.code(u, self.expected(u, seen))
+        over = np.maximum(error + self.level - self.image, 0)
+        return np.asarray(np.where(self.clipped, over, error) / self.deviation)
+
+    def expected(self, u: Array, seen: Array) -> Array:
+        """Radiance (H, W, 3) of the pixels."""
+        return np.asarray(seen[..., :3] * np.exp(u[_GAIN]) + (1 - seen[..., 3:]) * self.room)
+
+    def code(self, u: Array, model: Array, slopes: Array | None = None) -> Array:
+        """Radiance (H, W, 3) as an 8-bit file has it; or (n, H, W, 3), the ``slopes`` as that
+        changes them.
+
+        A JPEG's colours, differences to luma, all three through a display's curve, are blurred.
+        """
+        if not self.coded:
+            return model if slopes is None else slopes
+
+        def mix(image: Array) -> Array:
+            luma = (image @ LUMA)[..., None]
+            return np.asarray(luma + _blur(image - luma, math.exp(u[_COLOUR])))
+
+        model = np.maximum(model, 1e-6)
+        mixed = np.maximum(mix(model ** (1 / CURVE)), 1e-3)
+        if slopes is None:
+            return np.asarray(mixed**CURVE)
+        return np.asarray(mix(slopes * model ** (1 / CURVE - 1)) * mixed ** (CURVE - 1))
+
+    def cost(self, u: Array) -> float:
+        """Cauchy's loss of the errors and half the prior's square."""
+        r = self.errors(u, self.look(u)[0])[self.use]
+        off = u - self.usual
+        return float(ROBUST**2 / 2 * np.log1p((r / ROBUST) ** 2).sum() + off @ self.prior @ off / 2)
+
+    def normal_equations(self, u: Array) -> tuple[Array, Array]:
+        """Gauss–Newton's matrix and right side for the free unknowns, with Cauchy's weights."""
+        seen, *slopes = self.look(u, True)
+        r = self.errors(u, seen)[self.use]
+        gain = np.exp(u[_GAIN])
+        model = self.expected(u, seen)
+        by = np.zeros((_COUNT, *model.shape))
+        places = [*range(6), _BLUR] if self.free[0] else [_BLUR]
+        for k, d in zip(places, [*slopes[:-2], slopes[-1]], strict=True):
+            by[k] = d[..., :3] * gain - d[..., 3:] * self.room
+        for c in range(3):
+            by[6 + c, ..., c] = slopes[-2][..., c] * gain[c]
+            by[9 + c, ..., c] = seen[..., c] * gain[c]
+        by = self.code(u, model, by)
+        if self.coded:
+            more = u + _STEP * (np.arange(_COUNT) == _COLOUR)
+            by[_COLOUR] = (self.code(more, model) - self.code(u, model)) / _STEP
+        jacobian = np.moveaxis(by[self.free] / self.deviation, 0, -1)[self.use]
+        jacobian[self.clipped[self.use] & (r == 0)] = 0
+        j = jacobian.reshape(r.size, -1)
+        weighted = j / (1 + (r.reshape(-1, 1) / ROBUST) ** 2)
+        prior = self.prior[self.free]
+        matrix = j.T @ weighted + prior[:, self.free]
+        return matrix, weighted.T @ r.reshape(-1) - prior @ (u - self.usual)
+
+    def rest(self, error: Array) -> float:
+        """Root mean square of errors (n, 3), with Huber's weights."""
+        if not error.size:
             return 0.0
-        error = np.abs(self.error * self.scale)[seen]
         weight = np.minimum(1, 2 * np.median(error, 0) / np.maximum(error, 1e-12))
         return float(np.sqrt(((weight * error**2).sum(0) / weight.sum(0)).mean()))
-
-    def prior(self, u: Array) -> tuple[Array, Array]:
-        """The prior's information (13, 13) and its gradient at ``u``."""
-        matrix = np.zeros((13, 13))
-        matrix[np.arange(6), np.arange(6)] = 1
-        apart = np.eye(3) - 1 / 3
-        matrix[_GAMMA, _GAMMA] = apart / CHANNEL_PRIOR**2 + 1 / 9 / GAMMA_PRIOR**2
-        target = np.zeros(13)
-        matrix[_BLUR, _BLUR] = 1.0
-        target[_BLUR] = 0.4
-        return matrix, matrix @ (u - target)
 
     def result(self, u: Array) -> Screen:
         """What the fit says, with the pattern through the display's curve."""
         gamma, gain = np.exp(u[_GAMMA]), np.exp(u[_GAIN])
-        inside = self.share > 0.98
-        seen = inside & ~self.clipped.any(-1)
-        residual = self.rest(seen) / float(gain.mean())
+        seen = self.look(u)[0]
+        inside = seen[..., 3] > 0.98
+        open_ = inside & ~self.clipped.any(-1)
+        error = np.abs(self.errors(u, seen) * self.deviation)
+        residual = self.rest(error[open_]) / float(gain.mean())
         spread = np.zeros(6)
         if self.free[0]:
-            spread = np.sqrt(np.diag(np.linalg.inv(self.information))[:6])
+            spread = np.sqrt(np.diag(np.linalg.inv(self.normal_equations(u)[0]))[:6])
         units = SHIFT_PRIOR * self.rig.sample_size, TILT_PRIOR
         return Screen(
             rig=self.moved(u),
             shown=np.maximum(self.full, 0) ** gamma,
             gain=gain,
             gamma=gamma,
-            blur=float(u[_BLUR]) * self.step,
+            blur=math.exp(u[_BLUR]) * self.step,
             residual=residual,
             ideal_residual=residual,
             deviation=(
                 float(np.linalg.norm(spread[:3])) * units[0],
                 float(np.linalg.norm(spread[3:])) * units[1],
             ),
-            pixels=int(seen.sum()) * self.step**2,
-            saturated=float(1 - seen.sum() / max(inside.sum(), 1)),
+            pixels=int(open_.sum()) * self.step**2,
+            saturated=float(1 - open_.sum() / max(inside.sum(), 1)),
         )
