@@ -30,7 +30,7 @@ Array = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]
 FINE = 3  # points of a line to each of the view's pixels
 SPACING = 0.014  # of the unknown table's nodes, in radii
-ROUGH = 0.08  # usual second difference from one to the next, of the radiance's median
+ROUGH = 0.03  # usual second difference from one to the next, of the radiance's median
 NEAREST, FARTHEST = 0.80, 3.0  # radii where the lines begin, and to which the table is looked up
 # Lines, blur in the view's pixels, radii to which the table is unknown, steps, radii to start from.
 STAGES = (
@@ -45,7 +45,7 @@ _TILT, _BLUR, _MIRROR = slice(3, 5), 5, 6
 TILT_PRIOR, BLUR_PRIOR, MIRROR_PRIOR = 1.5, 0.15, 0.01
 USUAL_BLUR = 0.8
 OUT = 4.0  # spreads
-ROBUST = 1.5  # spreads from which a residual counts less
+ROBUST = 1.25  # spreads from which a residual counts less
 GUESS = 0.01  # of the radiance: its spread, before it is known
 FAITH = 0.004  # of the radiance: the least spread
 HORIZON = 0.5  # of a pixel: the least spread of the horizon's edge
