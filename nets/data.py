@@ -93,36 +93,29 @@ def make_group(rng: np.random.Generator, options: Options) -> list[Sample]:
                 continue
             if options.network:
                 known_lights = known_lights or prepare(make_scene(known, pattern, seen, gain))
-                out += _for_correction(packed, unit, known_lights, options)
-            else:
-                out.append(packed)
+                packed = _for_correction(packed, unit, known_lights, options)
+            out.append(packed)
     return out
 
 
 def _for_correction(
     sample: Sample, unit: float, prepared: Tables | Unbiased, options: Options
-) -> list[Sample]:
-    """What a network makes of a capture, as the correction sees it; and, where an earlier
-    correction is given, what that makes of it, as the next pass sees it."""
+) -> Sample:
+    """What a network makes of a capture, as the correction sees it."""
     batch = {
         k: torch.from_numpy(v.astype(np.float32))[None] for k, v in sample.items() if k != "maps"
     }
     batch["position"] = positions(options.size, options.size)[None]
+    found = estimate_of(predict(network_cached(options.network), batch), unit)
     photo = np.moveaxis(sample["photo"].astype(np.float32), 0, -1) * unit
     clipped = (photo >= 0.999 * photo.max()).any(-1)
     lobes = fit_lobes(photo, prepared, options.samples)
-    passes = []
-    for path in filter(None, (options.network, options.correction)):
-        found = estimate_of(predict(network_cached(path), batch), unit)
-        seen = linearised(photo, prepared, found, lobes, clipped, options.samples)
-        batch = {k: torch.from_numpy(v)[None] for k, v in seen.items()}
-        kept = {k: np.clip(v, -6e4, 6e4).astype(np.float16) for k, v in seen.items()}
-        del kept["position"]
-        passes.append({**kept, "maps": sample["maps"]})
-    return passes
+    seen = linearised(photo, prepared, found, lobes, clipped, options.samples)
+    out = {k: np.clip(v, -6e4, 6e4).astype(np.float16) for k, v in seen.items() if k != "position"}
+    return {**out, "maps": sample["maps"]}
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=1)
 def network_cached(path: str) -> torch.nn.Module:
     return load_weights(Path(path))[0]
 
@@ -189,10 +182,8 @@ def check_options(options: Options) -> None:
     if not 0 <= options.procedural <= 1:
         raise InputError("--procedural is a share between 0 and 1")
     light_pattern(options.pattern)
-    if options.correction and not options.network:
-        raise InputError("--correction corrects the maps of a --network: give both")
-    for path in filter(None, (options.network, options.correction)):
-        network_cached(path)
+    if options.network:
+        network_cached(options.network)
     if options.materials:
         find_materials(Path(options.materials))
     if options.envs:

@@ -48,8 +48,7 @@ class Options:
     procedural: share of made-up materials and rooms where folders are given. per_room: captures in
     the same room with the same rig. pattern: an image file, or the default pattern where empty.
     network: weights; where given, captures are not for that network but for the correction of its
-    maps (`nets.correction`). correction: weights of an earlier one; where given, each capture comes
-    twice, with the network's maps and with what that correction makes of them.
+    maps (`nets.correction`).
     """
 
     size: int = 128
@@ -63,7 +62,6 @@ class Options:
     env_height: int = 64
     pattern: str = ""
     network: str = ""
-    correction: str = ""
 
 
 @lru_cache(maxsize=2)

@@ -32,7 +32,8 @@ Array = NDArray[np.floating[Any]]
 
 WEIGHTS = Path(__file__).with_name("weights")
 TILE, OVERLAP = 1024, 64
-PASSES = 2  # of the correction
+PASSES = 3  # of the correction, at most
+SETTLED = 0.04  # mean change of roughness from which on another pass follows
 
 
 @dataclass
@@ -105,16 +106,20 @@ class Corrector:
         keep: Path | None = None,
         progress: Callable[[float], None] = lambda share: None,
     ) -> Estimate:
-        """`PASSES` steps from an estimate towards what explains the photo (H, W, 3); ``clipped``:
-        where it is saturated. Ctrl-C ends it with what was found so far; keep: as for
-        `Reconstructor`. ``progress`` is told the share done."""
+        """Steps from an estimate towards what explains the photo (H, W, 3), until one changes
+        roughness by less than `SETTLED` or there were `PASSES`; ``clipped``: where the photo is
+        saturated. Ctrl-C ends it with what was found so far; keep: as for `Reconstructor`.
+        ``progress`` is told the share done."""
         try:
             lobes = fit_lobes(photo, prepared, samples)
             for i in range(PASSES):
                 report = partial(_told, progress, i / PASSES, 1 / PASSES)
+                before = estimate.maps.roughness
                 estimate = self._step(
                     photo, prepared, estimate, lobes, clipped, samples, keep, report
                 )
+                if np.abs(estimate.maps.roughness - before).mean() < SETTLED:
+                    break
         except KeyboardInterrupt:
             estimate = replace(estimate, interrupted=True)
         return estimate
