@@ -28,7 +28,7 @@ Mask = NDArray[np.bool_]
 SCREEN_MARGIN, BLURS = 1.5, 2.5
 # A veil over the ball is told from the table that is mirrored from 1.8 radii on.
 BARE = 1.8
-VEILED = 0.85  # what it must leave of the residuals' cost to be believed
+VEILED = 0.6  # what it must leave of the residuals' cost, where it is strong, to be believed
 
 
 def screen_coordinates(rig: Rig, origin: Array, direction: Array) -> tuple[Array, Array, Mask]:
@@ -162,8 +162,8 @@ def lift_veil(photo: Photo, rig: Rig, ball: Ball) -> Photo:
         seen = veil(p, inside[use]) - mirror * veil(p, outside)
         return np.asarray((seen - extra / spread).ravel())
 
-    def cost(p: Array) -> float:
-        return float(np.log1p(off(p) ** 2).sum())
+    def cost(p: Array, weight: Any = 1.0) -> float:
+        return float((np.log1p(off(p) ** 2).reshape(-1, 3) * weight).sum())
 
     starts = []
     for angle in np.arange(12) * (math.pi / 6):
@@ -172,9 +172,18 @@ def lift_veil(photo: Photo, rig: Rig, ball: Ball) -> Photo:
         if near.any():
             start[3:] = np.maximum(np.median(extra[near], 0) / spread, 0)
             starts.append(start)
+    if not starts:
+        return photo
     bounds = [-2, -2, 0.1, 0, 0, 0], [2, 2, 1, np.inf, np.inf, np.inf]
     p = optimize.least_squares(off, min(starts, key=cost), bounds=bounds, loss="cauchy").x
-    if not cost(p) < VEILED * cost(np.array([0.0, 0, 1, 0, 0, 0])):
+    strength = veil(p, inside).sum(-1)
+    most = strength[use].max()
+    strong = (strength[use] > most / 2)[:, None]
+    # Nor is it believed where it would be stronger than anywhere it can be seen.
+    sky = seen & (mirrored[..., 2] > 0)
+    if not cost(p, strong) < VEILED * cost(p * [1, 1, 1, 0, 0, 0], strong) or (
+        strength[sky].max(initial=0) > most
+    ):
         return photo
     image = photo.image.copy()
     lifted = np.maximum(image[area] - veil(p, inside) * spread, 0)
