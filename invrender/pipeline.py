@@ -39,7 +39,7 @@ FINAL_SAMPLES = 256
 FAR_OFF = 0.1  # of its size that the screen may hang off before the rig is in doubt
 # `coarse_error` from which the maps are in doubt; from a flat start each pixel's albedo explains
 # more.
-POOR_FIT = {"network": 0.2, "flat": 0.1}
+POOR_FIT = {"network": 0.25, "flat": 0.1}
 BLOCKS = 16  # a side, whose means the coarse error compares
 BAKED = 0.6  # correlation of albedo and light, negative, from which the lights are in doubt
 
