@@ -38,7 +38,8 @@ WORTH = 50.0  # of half a chi-squared, by which another pose or curve must be li
 SATURATED = 0.01  # share of saturated pixels from which it is told, and the screen fitted with care
 NO_CURVE = 0.2  # share of saturated pixels from which gain and gamma cannot be told apart
 # Pixels of blur through which the screen is looked for, and what of the cost a step must gain.
-STAGES = ((2.5, 1e-3), (1.0, 1e-3), (0.0, 1e-3), (0.0, 1e-6))
+# Through the greatest blur the room behind the screen is vague: a few steps, and it is told anew.
+STAGES = ((2.5, 0.03), (2.5, 0.03), (1.0, 1e-2), (0.0, 1e-3), (0.0, 1e-6))
 EDGE = 3  # pixels outside the screen's image that are compared as well
 
 
@@ -76,20 +77,25 @@ def fit_screen(photo: Photo, rig: Rig, ball: Ball, pattern: Array) -> Screen:
     """
     fit = _Fit(photo, rig, ball, pattern)
     u = fit.start()
-    for stage in STAGES[2:]:
+    for stage in STAGES[-2:]:
         u = fit.solve(u, *stage)
     ideal = fit.result(u)
     if ideal.residual < POOR and ideal.saturated < SATURATED:
         return ideal
     fit.free[:_COLOUR] = True
     fit.free[_GAMMA] = ideal.saturated < NO_CURVE
-    start, u = u, fit.start()
-    for blurred, least in STAGES:
-        u = fit.solve(u, blurred * max(1.0, fit.radius / 60), least)
-    moved = replace(fit.result(u), ideal_residual=ideal.residual)
+    start = u
+    for first in (0, 2):  # if the greatest blur leads astray, without it
+        u = fit.start()
+        for blurred, least in STAGES[first:]:
+            u = fit.solve(u, blurred * max(1.0, fit.radius / 60), least)
+        better = fit.cost(start) - fit.cost(u) > WORTH
+        if better:
+            break
     # A saturated pixel had at least so much light, which the ideal screen alone may not explain.
-    better = fit.cost(start) - fit.cost(u) > WORTH or ideal.saturated > SATURATED
-    return moved if better else ideal
+    if better or ideal.saturated > SATURATED:
+        return replace(fit.result(u), ideal_residual=ideal.residual)
+    return ideal
 
 
 # Places of the unknowns: shift and tilt in units of their priors, log gamma and log gain a channel,
@@ -387,8 +393,12 @@ class _Fit:
         return np.asarray(mix(slopes * model ** (1 / CURVE - 1)) * mixed ** (CURVE - 1))
 
     def cost(self, u: Array) -> float:
-        """Cauchy's loss of the errors and half the prior's square."""
-        r = self.errors(u, self.look(u)[0])[self.use]
+        """Cauchy's loss of the errors and half the prior's square; no rig, no end of it."""
+        try:
+            seen = self.look(u)[0]
+        except InputError:  # a screen that reaches below the table
+            return math.inf
+        r = self.errors(u, seen)[self.use]
         off = u - self.usual
         return float(ROBUST**2 / 2 * np.log1p((r / ROBUST) ** 2).sum() + off @ self.prior @ off / 2)
 
