@@ -25,7 +25,7 @@ Array = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]
 # Pixels around the screen's image that may hold some of its light, and how many more for each of
 # the camera's blur: the screen is often a hundred times as bright as the room beside it.
-SCREEN_MARGIN, BLURS = 1.5, 2.5
+SCREEN_MARGIN, BLURS = 1.5, 1.5
 # A veil over the ball is told from the table that is mirrored from 1.8 radii on.
 BARE = 1.8
 VEILED = 0.6  # what it must leave of the residuals' cost, where it is strong, to be believed

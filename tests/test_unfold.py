@@ -8,7 +8,12 @@ from synthetic_photo import blocks, grey_table, photograph, sky, textured_table
 from invrender.images import Photo
 from invrender.mirror import make_ball
 from invrender.rig import Rig
-from invrender.unfold import lift_veil, unfold_environment
+from invrender.unfold import (
+    fill_environment,
+    lift_veil,
+    room_irradiance,
+    unfold_environment,
+)
 
 RIG, SIZE = Rig(), (720, 960)
 BALL = make_ball(RIG, RIG.ball_centre, RIG.ball_radius, SIZE)
@@ -52,13 +57,23 @@ def test_saturated_pixels_stay_saturated(image):
 
 
 def test_the_screen_does_not_light_the_room_beside_it():
-    """A dark room: all light beside a blurred screen is the screen's."""
-    dark = photograph(RIG, *SIZE, lambda d: 0.01 + 0 * d, grey_table, blocks(), (3.0, 3.0, 3.0))
+    """A room 30 times as dark as the screen: its light must not count as the room's."""
+    level = 0.1
+    dark = photograph(RIG, *SIZE, lambda d: level + 0 * d, grey_table, blocks(), (3.0, 3.0, 3.0))
     photo = Photo(ndimage.gaussian_filter(dark, (1.2, 1.2, 0)))
+    even = np.where(np.arange(64)[:, None, None] < 32, level, 0) * np.ones((64, 128, 3))
 
     def error(blur):
         room, coverage = unfold_environment(photo, RIG, BALL, 64, blur=blur)
         assert coverage[:32].mean() > 0.6
-        return np.abs(room[:24] / 0.01 - 1).max(-1)[coverage[:24] > 0].max()
+        found, true = (
+            room_irradiance(RIG, np.zeros((1, 3)), e)
+            for e in (fill_environment(room, coverage), even)
+        )
+        return np.abs(room[:24] / level - 1)[coverage[:24] > 0].max(), np.abs(
+            found / true - 1
+        ).max()
 
-    assert error(0) > 1 and error(1.2) < 0.05
+    (texel, light), (told_texel, told_light) = error(0), error(1.2)
+    assert texel > 1 and told_texel < 0.3
+    assert light > 0.05 and told_light < 0.02
