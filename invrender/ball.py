@@ -59,6 +59,8 @@ def find_ball(photo: Photo, rig: Rig, manual: tuple[float, float, float] | None 
             "read: take a larger photo or check rig.toml"
         )
     middle = np.asarray(expected.centre)
+    if not ((middle >= 0) & (middle <= size[::-1])).all():  # also where it is no number
+        raise InputError("the rig puts the ball outside the photo: check its lengths and its tilt")
     view = view_around(photo, middle, (SEARCH + 1.5) * expected.radius, expected.radius / 48)
     starts = []
     for start in _coarse(view, rig, expected):

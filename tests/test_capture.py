@@ -250,6 +250,14 @@ def test_fill_is_exact_for_constant_light_and_smooth():
         fill_environment(constant, np.zeros_like(coverage))
 
 
+@pytest.mark.parametrize("tilt", [37.0, 66.0, 120.0])
+def test_a_ball_outside_the_photo_is_refused(clean, tilt):
+    """A camera that looks past the ball, or away from it."""
+    away = replace(RIG, camera_tilt=(tilt, 0.0, 0.0))
+    with pytest.raises(InputError, match="outside the photo"):
+        find_ball(Photo(clean), away)
+
+
 def test_photo_without_a_screen_is_refused(clean):
     dark = photograph(RIG, *SIZE, gain=(0.0, 0.0, 0.0))
     with pytest.raises(InputError, match="screen is dark"):
