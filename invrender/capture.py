@@ -129,7 +129,12 @@ def check_photo(photo: Photo, name: str = "the photo") -> None:
 def _inside(folder: Path, name: str) -> Path:
     """A file named in ``rig.toml``; it must lie in the capture's folder."""
     path = folder / name
-    if not path.resolve().is_relative_to(folder.resolve()):
+    try:
+        path.exists()  # raises for what is too long, or has a null in it
+        inside = path.resolve().is_relative_to(folder.resolve())
+    except (OSError, ValueError):
+        raise InputError(f"{folder}/rig.toml: {name[:40]!r} is no file name") from None
+    if not inside:
         raise InputError(f"{folder}/rig.toml: '{name}' leads out of the capture's folder")
     return path
 

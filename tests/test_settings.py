@@ -80,6 +80,8 @@ def one_sentence(text):
 
 @settings(max_examples=150, **QUICK)
 @given(st.dictionaries(KEY, VALUE, min_size=1, max_size=3))
+@example({("pattern", "image"): "\0"})
+@example({("pattern", "image"): 5000 * "a"})
 @example({("camera", "tilt"): [90.0, 0.0, 0.0]})
 @example({("camera", "tilt"): 1e300})
 @example({("screen", "size"): 1e300})
