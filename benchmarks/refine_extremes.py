@@ -27,7 +27,7 @@ from invrender.initial import baked_light, flat_maps
 from invrender.lobes import fit_lobes
 from invrender.maps import Maps, constant_maps, map_errors
 from invrender.pattern import default_pattern
-from invrender.pipeline import BAKED, POOR_FIT, coarse_error
+from invrender.pipeline import BAKED, POOR_FIT, coarse_error, photo_error
 from invrender.prior import lobe_prior, network_prior, project, to_theta
 from invrender.refine import Shot, correct, refine
 from invrender.render import make_scene, picture, prepare
@@ -125,13 +125,12 @@ def run(case: Case, seed: int, init: str) -> dict[str, Any]:
     baked = baked_light(result.maps.diffuse, prepared)
     seen = np.ones(photo.shape[:2], bool) if clipped is None else ~clipped
     shown = picture(prepared, result.maps, 256)
-    photo_error = float(np.sqrt(np.mean((shown - photo)[seen] ** 2)) / photo[seen].mean())
     coarse = coarse_error(shown, photo, ~seen)
     moved = np.abs(to_theta(result.maps) - project(prior.mean.copy())).max(-1)
     return {
         "initial": before,
         "refined": after,
-        "photo_error": photo_error,
+        "photo_error": photo_error(shown, photo, ~seen),
         "coarse_error": coarse,
         "iterations": max(len(result.history) - 1, 1),
         "converged": result.converged,
@@ -158,30 +157,13 @@ def main() -> None:
         maps = [f"{r['initial'][n]:.3f} → {r['refined'][n]:.3f}" for n in r["initial"]]
         end = "yes" if r["converged"] else "no"
         end += ", warns" if r["warns"] else ""
-        row = [
-            name,
-            init,
-            *maps,
-            r["photo_error"],
-            r["coarse_error"],
-            r["baked"],
-            r["iterations"],
-            end,
-            r["seconds"],
-        ]
+        numbers = (r[k] for k in ("photo_error", "coarse_error", "baked", "iterations"))
+        row = [name, init, *maps, *numbers, end, r["seconds"]]
         rows.append(row)
         print(*row, "" if r["finite"] else "NOT FINITE", flush=True)
     names = [*next(iter(results.values()))["initial"]]
-    header = [
-        "case",
-        "start",
-        *names,
-        "photo error",
-        "light in albedo",
-        "steps",
-        "converged",
-        "seconds",
-    ]
+    header = ["case", "start", *names, "photo error", "coarse", "light in albedo", "steps"]
+    header += ["converged", "seconds"]
     (args.out / "refine_extremes.md").write_text(markdown(header, rows))
     write_results(args.out, {"cases": results})
 

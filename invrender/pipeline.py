@@ -259,7 +259,7 @@ def refine_capture(
         lights = shots[0].prepared
         baked = baked_light(result.maps.diffuse, lights, samples)
         pictures = [picture(lights, maps, FINAL_SAMPLES) for maps in (start, result.maps)]
-    before, after = (_photo_error(p, first.photo, first.clipped) for p in pictures)
+    before, after = (photo_error(p, first.photo, first.clipped) for p in pictures)
     coarse = coarse_error(pictures[1], first.photo, first.clipped)
     errors = None
     if first.capture.truth is not None:
@@ -310,7 +310,7 @@ def _networks() -> tuple[Any, Any]:
     return Reconstructor(), Corrector()
 
 
-def _photo_error(picture: Array, photo: Array, clipped: NDArray[np.bool_]) -> float:
+def photo_error(picture: Array, photo: Array, clipped: NDArray[np.bool_]) -> float:
     """RMS difference over the photo's mean, where the photo is not saturated."""
     seen = ~clipped if not clipped.all() else np.ones_like(clipped)
     difference = (picture - photo)[seen].astype(np.float64)
