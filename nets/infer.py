@@ -85,7 +85,7 @@ class Reconstructor:
         batch = {k: torch.from_numpy(v)[None] for k, v in lights.items()}
         batch["photo"] = torch.from_numpy(np.ascontiguousarray(photo.transpose(2, 0, 1)))[None]
         batch["position"] = positions(*photo.shape[:2])[None]
-        kept = keep and keep / _digest(self.notes, photo, *lights.values())
+        kept = keep and _kept(keep, self.notes, photo, *lights.values())
         out = predict(self.network, batch, partial(_told, report, 0.3, 0.7), kept)
         return estimate_of(out, white_level(lights))
 
@@ -141,8 +141,9 @@ class Corrector:
         def cut(rows: slice, columns: slice) -> Batch:
             return {k: v[..., columns] for k, v in band(rows.start, rows.stop).items()}
 
-        known = (to_theta(estimate.maps), *estimate.sigma.values(), to_theta(lobes))
-        kept = keep and keep / _digest(self.notes, photo, *known)
+        known = [*vars(estimate.maps).values(), *estimate.sigma.values(), *vars(lobes).values()]
+        known += [np.array(samples)] + ([] if clipped is None else [clipped])
+        kept = keep and _kept(keep, self.notes, photo, *known)
         out = predict_tiles(self.network, photo.shape[:2], cut, progress, kept)
         return estimate_of(out, estimate.unit)
 
@@ -152,12 +153,15 @@ def _told(progress: Callable[[float], None], start: float, length: float, share:
     progress(start + length * share)
 
 
-def _digest(notes: dict[str, Any], *arrays: Array) -> str:
-    """Of a network's notes and what it sees."""
+def _kept(folder: Path, notes: dict[str, Any], photo: Array, *seen: NDArray[Any]) -> Path | None:
+    """Where in ``folder`` the tiles of a photo lie, by a digest of the network's notes and of all
+    that it sees; None for a photo of one tile, which is not worth keeping."""
+    if max(photo.shape[:2]) <= TILE:
+        return None
     digest = hashlib.sha256(json.dumps(notes, sort_keys=True).encode())
-    for array in arrays:
+    for array in (photo, *seen):
         digest.update(np.ascontiguousarray(array).data)
-    return digest.hexdigest()[:16]
+    return folder / digest.hexdigest()[:16]
 
 
 def linearised(
@@ -216,14 +220,13 @@ def predict_tiles(
     keep: Path | None = None,
 ) -> Batch:
     """A network's output (B, C, H, W), tile by tile; ``cut`` gives the batch of some rows and
-    columns. Tiles come in bands of rows. Where there are several, each is kept in the folder
-    ``keep``, or read from there."""
+    columns. Tiles come in bands of rows. Each is kept in the folder ``keep`` or read from there."""
     height, width = shape
     tiles = list(_tiles(height, width))
     sums: dict[str, Tensor] = {}
     total = torch.zeros(1, 1, height, width)
     for i, (rows, columns) in enumerate(tiles):
-        path = keep / f"{i}.safetensors" if keep and len(tiles) > 1 else None
+        path = keep and keep / f"{i}.safetensors"
         if path and path.exists():
             out = load_file(path)
         else:
