@@ -51,7 +51,7 @@ def train_variant(name: str, args: argparse.Namespace) -> list[dict[str, float]]
         "--preset", args.preset, "--clues", clues, "--active", active, "--slopes", slopes,
         "--denoiser", denoiser, "--steps", str(args.steps), "--every", str(args.every),
         "--crop", str(args.crop), "--batch", str(args.batch), "--valid-count", "96",
-        "--threads", str(args.threads),
+        "--threads", str(args.threads), "--device", args.device,
     ])  # fmt: skip
     train(options)
     with open(out / "log.csv", newline="") as f:
@@ -67,9 +67,12 @@ def main() -> None:
     p.add_argument("--preset", default="tiny")
     p.add_argument("--variant", choices=tuple(VARIANTS), action="append", help="only this one")
     p.add_argument("--steps", type=int, default=3000)
+    p.add_argument("--crop", type=int, default=64)
+    p.add_argument("--batch", type=int, default=8)
     p.add_argument("--threads", type=int, default=1)
+    p.add_argument("--device", default="cpu")
     args = p.parse_args()
-    args.every, args.crop, args.batch = max(args.steps // 10, 1), 64, 8
+    args.every = max(args.steps // 10, 1)
     args.out.mkdir(parents=True, exist_ok=True)
     if args.quick or args.data is None:
         make_data(args.out)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import torch
 from safetensors import safe_open
+from safetensors.torch import load_file
 from torch import Tensor
 
 from invrender.errors import InputError
@@ -15,6 +17,7 @@ from nets.model import Batch
 
 GROUP = 8  # shards that are shuffled together
 PIXELS = ("photo", "ideal", "maps", "clipped", "theta", "sigma0", "image", "jacobian", "lobes")
+CPU = torch.device("cpu")
 
 
 def shards(folder: Path) -> list[Path]:
@@ -32,42 +35,53 @@ def positions(height: int, width: int) -> Tensor:
     return torch.stack(torch.meshgrid(x, y, indexing="xy"))
 
 
-def _read(path: Path, rows: list[int], corners: np.ndarray | None, crop: int) -> Batch:
-    """Captures ``rows`` of a shard, cut to crop × crop at ``corners`` (row, column)."""
-    out: Batch = {}
-    with safe_open(path, "pt") as f:
-        size = f.get_slice("photo").get_shape()[-1]
-        crop = min(crop, size)
-        cuts = [(0, 0)] * len(rows) if corners is None else [
-            (int(u * (size - crop + 1)), int(v * (size - crop + 1))) for u, v in corners
-        ]  # fmt: skip
-        for key in f.keys():  # noqa: SIM118  (no dict)
-            source = f.get_slice(key)
-            if key in PIXELS:
-                parts = [
-                    source[r : r + 1, :, y : y + crop, x : x + crop]
-                    for r, (y, x) in zip(rows, cuts, strict=True)
-                ]
-            else:
-                parts = [source[r : r + 1] for r in rows]
-            tensor = torch.cat(parts)
-            out[key] = tensor if key == "maps" else tensor.float()
-    grid = positions(size, size)
-    out["position"] = torch.stack([grid[:, y : y + crop, x : x + crop] for y, x in cuts])
-    return out
-
-
 def count(path: Path) -> int:
     """Captures in a shard."""
     with safe_open(path, "pt") as f:
         return int(f.get_slice("photo").get_shape()[0])
 
 
-def read_batch(path: Path, batch: int) -> Iterator[Batch]:
+_keep = cache(load_file)
+
+
+def _load(paths: Sequence[Path], device: torch.device) -> Batch:
+    """The captures of some shards, one after another. A GPU keeps every shard that it has seen."""
+    load = _keep if device.type == "cuda" else load_file
+    parts = [load(path, str(device)) for path in paths]
+    return {k: torch.cat([part[k] for part in parts]) for k in parts[0]}
+
+
+def _cut(
+    captures: Batch,
+    rows: Sequence[int] | np.ndarray,
+    corners: np.ndarray | None = None,
+    crop: int = 1 << 16,
+) -> Batch:
+    """Captures ``rows``, whole or cut to crop × crop at ``corners`` (row, column in [0, 1])."""
+    photo = captures["photo"]
+    size = photo.shape[-1]
+    crop = min(crop, size)
+    cuts = [(0, 0)] * len(rows) if corners is None else [
+        (int(u * (size - crop + 1)), int(v * (size - crop + 1))) for u, v in corners
+    ]  # fmt: skip
+    index = torch.as_tensor(rows, device=photo.device)
+
+    def pixels(images: Tensor) -> Tensor:
+        parts = [x[:, r : r + crop, c : c + crop] for x, (r, c) in zip(images, cuts, strict=True)]
+        return images if crop == size else torch.stack(parts)
+
+    out = {k: pixels(v[index]) if k in PIXELS else v[index] for k, v in captures.items()}
+    out = {k: v if k == "maps" else v.float() for k, v in out.items()}
+    grid = positions(size, size).to(photo.device)
+    return {**out, "position": pixels(grid.expand(len(rows), -1, -1, -1))}
+
+
+def read_batch(path: Path, batch: int, device: torch.device = CPU) -> Iterator[Batch]:
     """A shard's captures in order, whole."""
-    n = count(path)
+    captures = _load([path], device)
+    n = len(captures["photo"])
     for start in range(0, n, batch):
-        yield _read(path, list(range(start, min(start + batch, n))), None, 1 << 16)
+        yield _cut(captures, range(start, min(start + batch, n)))
 
 
 def batches(
@@ -78,6 +92,7 @@ def batches(
     start: int = 0,
     rank: int = 0,
     world: int = 1,
+    device: torch.device = CPU,
 ) -> Iterator[Batch]:
     """Endless random crops, from step ``start`` on; each of ``world`` processes gets its own part.
 
@@ -89,20 +104,17 @@ def batches(
         paths = shards(folder)
         order = [paths[i] for i in rng.permutation(len(paths))]
         for at in range(0, len(order), GROUP):
-            members = [(p, i) for p in order[at : at + GROUP] for i in range(count(p))]
-            members = [members[i] for i in rng.permutation(len(members))]
+            group = order[at : at + GROUP]
+            members = rng.permutation(sum(count(p) for p in group))
             corners = rng.random((len(members), 2))
+            captures: Batch = {}
             for k in range(0, len(members) - batch * world + 1, batch * world):
                 step += 1
                 if step <= start:
                     continue
+                captures = captures or _load(group, device)
                 mine = slice(k + rank * batch, k + (rank + 1) * batch)
-                yield _gather(members[mine], corners[mine], crop)
+                yield _cut(captures, members[mine], corners[mine], crop)
         if step == 0:
             raise InputError(f"{folder} holds fewer captures than a batch of {batch * world}")
         epoch += 1
-
-
-def _gather(members: list[tuple[Path, int]], corners: np.ndarray, crop: int) -> Batch:
-    parts = [_read(p, [i], c[None], crop) for (p, i), c in zip(members, corners, strict=True)]
-    return {k: torch.cat([p[k] for p in parts]) for k in parts[0]}

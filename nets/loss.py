@@ -47,8 +47,8 @@ def compare(out: Batch, batch: Batch) -> dict[str, tuple[Tensor, Tensor]]:
     return result
 
 
-def total_loss(out: Batch, batch: Batch, config: Config) -> tuple[Tensor, dict[str, float]]:
-    """The loss and its parts as numbers.
+def total_loss(out: Batch, batch: Batch, config: Config) -> tuple[Tensor, Batch]:
+    """The loss, and it and its parts as numbers without gradients.
 
     Per map: mean |error| and mean squared error in units of `SPREAD`; L1 on the initial normals;
     the Gaussian negative log-likelihood of sigma given the error, which does not move the maps.
@@ -72,4 +72,4 @@ def total_loss(out: Batch, batch: Batch, config: Config) -> tuple[Tensor, dict[s
         ideal = encode(normalise({**batch, "target": batch["ideal"].float()}, config)["target"])
         parts["denoised"] = DENOISED_WEIGHT * 10 * (out["denoised"] - ideal).abs().mean()
     total = torch.stack(list(parts.values())).sum()
-    return total, {k: float(v.detach()) for k, v in parts.items()} | {"loss": float(total.detach())}
+    return total, {k: v.detach() for k, v in (*parts.items(), ("loss", total))}

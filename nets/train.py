@@ -59,7 +59,7 @@ class Trainer:
         self.step = self.skipped = 0
         self.seconds = 0.0
 
-    def update(self, batch: Batch, rate: float) -> dict[str, float]:
+    def update(self, batch: Batch, rate: float) -> Batch:
         """One step. A step whose loss or gradient is not finite changes nothing but a counter."""
         self.module.train()
         for group in self.optimiser.param_groups:
@@ -75,8 +75,12 @@ class Trainer:
         self.optimiser.step()
         decay = min(EMA_DECAY, (1 + self.step) / (10 + self.step))
         with torch.no_grad():
+            means, values = [], []
             for k, v in self.network.state_dict().items():
-                self.mean[k].lerp_(v, 1 - decay) if v.is_floating_point() else None
+                if v.is_floating_point():
+                    means.append(self.mean[k])
+                    values.append(v)
+            torch._foreach_lerp_(means, values, 1 - decay)
         return parts
 
     def save(self, notes: dict[str, Any]) -> None:
@@ -155,8 +159,7 @@ def errors(
     ratios: dict[str, list[Tensor]] = {k: [] for k in MAPS}
     seen = 0
     for path in shards(folder):
-        for b in read_batch(path, batch):
-            b = {k: v.to(device) for k, v in b.items()}
+        for b in read_batch(path, batch, device):
             for k, (square, ratio) in compare(network(b), b).items():
                 squares[k] += float(square.double().mean((1, 2, 3)).sum())
                 ratios[k].append(ratio[..., ::4, ::4].flatten().cpu())
@@ -222,9 +225,7 @@ def train(args: argparse.Namespace) -> Trainer:
     if rank == 0:
         (args.out / "options.json").write_text(json.dumps(vars(args), default=str, indent=1))
         print(f"{'resumed at' if resumed else 'starting from'} step {trainer.step}", flush=True)
-    stream = batches(
-        args.data, args.batch, args.crop, args.seed, start=trainer.step, rank=rank, world=world
-    )
+    stream = batches(args.data, args.batch, args.crop, args.seed, trainer.step, rank, world, device)
     run(trainer, stream, args, {k: Path(v) for k, v in valid.items()}, rank)
     return trainer
 
@@ -237,21 +238,20 @@ def run(
     rank: int,
 ) -> None:
     """Steps until ``args.steps``; validates and saves every ``args.every``."""
-    sums: dict[str, float] = {}
+    sums: Batch = {}
     count = 0
     start = time.perf_counter()
     while trainer.step < args.steps:
-        batch = {k: v.to(trainer.device) for k, v in next(stream).items()}
         rate = learning_rate(trainer.step, args.steps, args.rate, args.last_rate)
-        parts = trainer.update(batch, rate)
+        parts = trainer.update(next(stream), rate)
         count += bool(parts)
         for k, v in parts.items():
-            sums[k] = sums.get(k, 0.0) + v
+            sums[k] = sums[k] + v if k in sums else v
         if trainer.step % args.every and trainer.step < args.steps:
             continue
         trainer.seconds += time.perf_counter() - start
         if rank == 0:
-            means = {k: v / max(count, 1) for k, v in sums.items()}
+            means = {k: float(v) / max(count, 1) for k, v in sums.items()}
             row = {"step": trainer.step, "seconds": trainer.seconds, "skipped": trainer.skipped}
             row |= {f"train_{k}": v for k, v in means.items()}
             with trainer.averaged() as network:
