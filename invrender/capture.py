@@ -10,13 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.spatial.transform import Rotation
 
+from invrender.ball_view import view_around
 from invrender.clipped import raise_clipped
 from invrender.errors import InputError
 from invrender.images import PHOTOS, Photo, read_image, read_photo
 from invrender.maps import Maps, read_maps
 from invrender.mirror import Ball
 from invrender.rig import Rig, read_rig
+from invrender.rim import fit_rim
 from invrender.screen import SATURATED, fit_screen
 from invrender.unfold import (
     fill_environment,
@@ -40,6 +43,7 @@ SURE = 0.75  # confidence from which a ball is one even if its pattern fits as b
 # Shift in sizes of the sample, and tilt in degrees, that an error of the ball's place, a hundredth
 # of its radius, cannot explain: a smaller one is taken for such an error.
 MOVED = (0.022, 1.0)
+AROUND, FINE = 3.3, 64  # of the table about the ball, radii; pixels to a radius
 
 
 @dataclass(frozen=True)
@@ -69,9 +73,10 @@ class Lights:
     ``blur`` the camera's in pixels, ``pixels`` the number used, ``saturated`` and
     ``room_saturated`` the shares of screen and room in the ball that are saturated,
     ``room_raised`` how many times brighter the saturated lamps were made,
-    ``pattern_residual`` the residual before the screen's pose and curve were fitted. Where the
+    ``pattern_residual`` the residual before the screen's pose and curve were fitted,
+    ``camera_tilt`` how far the camera is found to look past straight down, in degrees. Where the
     pattern as it should be fits badly, ``pattern`` is as the display really shows it, and ``rig``
-    as the screen really hangs; else both are those of the capture.
+    as the screen really hangs; else both are those of the capture, but for the tilt (`level`).
     """
 
     environment: Array
@@ -215,6 +220,22 @@ def not_the_pattern(ball: Ball) -> InputError:
     )
 
 
+def level(photo: Photo, rig: Rig, ball: Ball) -> Rig:
+    """The rig with its table as it lies in the photo, by the ball's rim (`invrender.rim`).
+
+    A camera that does not look straight down sees the horizon's image off the ball's middle. A
+    photo cannot tell a turned camera from a turned table: camera and screen are turned together
+    about the ball's centre, so that the ball stays where it is and what the camera sees of the
+    screen too. A tilt that the rig tells is kept; a JPEG's rounding hides the horizon too well.
+    """
+    if any(rig.camera_tilt) or photo.clip_level is not None:
+        return rig
+    centre = np.asarray(ball.position)
+    view = view_around(photo, np.asarray(ball.centre), AROUND * ball.radius, ball.radius / FINE)
+    tilt = fit_rim(view, rig, np.array([*centre[:2], ball.radius_m])).rig.camera_tilt
+    return rig.turned(Rotation.from_rotvec(tilt, degrees=True), centre)
+
+
 def extract_lights(capture: Capture, ball: Ball, height: int = 128) -> Lights:
     """Unfold the ball: the environment (``height`` rows) and the screen's pattern and gain."""
     photo, rig = capture.photo, capture.rig
@@ -222,6 +243,8 @@ def extract_lights(capture: Capture, ball: Ball, height: int = 128) -> Lights:
         raise InputError("the ball was found in a photo of another size")
     if height < 8 or height % 2:
         raise InputError(f"the environment needs an even height of 8 rows or more, got {height}")
+    rig = level(photo, rig, ball)
+    tilted = math.degrees(math.acos(min(1.0, float(rig.camera_axes[2, 2]))))
     photo = lift_veil(photo, rig, ball)
     screen = fit_screen(photo, rig, ball, capture.pattern)
     pattern, gain = screen.shown, screen.gain
@@ -235,6 +258,7 @@ def extract_lights(capture: Capture, ball: Ball, height: int = 128) -> Lights:
         "residual": screen.residual, "pattern_residual": screen.ideal_residual,
         "gamma": float(np.mean(screen.gamma)), "blur": screen.blur, "pixels": float(screen.pixels),
         "saturated": screen.saturated, "screen_shift": shift, "screen_tilt": tilt,
+        "camera_tilt": tilted,
     }  # fmt: skip
     # A display far from its place or with another curve explains a poor ideal fit, if it fits.
     if (

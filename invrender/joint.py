@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -31,19 +29,7 @@ def turned_rig(rig: Rig, quarters: int) -> Rig:
 
     It is for the forward model alone: the ball stays, and photos are not taken along.
     """
-    turn = Rotation.from_rotvec([0, 0, 90 * quarters], degrees=True)
-    e_x, e_y = rig.screen_edges
-    centre = rig.screen_corner + e_x / 2 + e_y / 2
-    nominal = centre - np.asarray(rig.screen_shift)
-    tilt = turn * Rotation.from_rotvec(rig.screen_tilt, degrees=True)
-    shift = turn.apply(centre) - nominal
-    camera = turn.apply(rig.camera) - (rig.camera - np.asarray(rig.camera_shift))
-    return replace(
-        rig,
-        screen_shift=tuple(shift.tolist()),
-        screen_tilt=tuple(tilt.as_rotvec(degrees=True).tolist()),
-        camera_shift=tuple(camera.tolist()),
-    )
+    return rig.turned(Rotation.from_rotvec([0, 0, 90 * quarters], degrees=True), np.zeros(3))
 
 
 def turned_environment(environment: Array, quarters: int) -> Array:

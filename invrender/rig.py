@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -156,6 +156,26 @@ class Rig:
     def ball_centre(self) -> Array:
         """Centre of the mirror (hemi)sphere, on the table below the nominal camera."""
         return np.array([self.optical_axis_x, 0.0, 0.0])
+
+    def turned(self, turn: Rotation, centre: Array) -> Rig:
+        """Camera and screen turned about a point (3,); the ball's nominal place stays."""
+        e_x, e_y = self.screen_edges
+        screen = self.screen_corner + e_x / 2 + e_y / 2
+
+        def moved(shift: Vec3, at: Array) -> Any:
+            return tuple((shift + centre + turn.apply(at - centre) - at).tolist())
+
+        def tilted(tilt: Vec3) -> Any:
+            both = turn * Rotation.from_rotvec(tilt, degrees=True)
+            return tuple(both.as_rotvec(degrees=True).tolist())
+
+        return replace(
+            self,
+            screen_shift=moved(self.screen_shift, screen),
+            screen_tilt=tilted(self.screen_tilt),
+            camera_shift=moved(self.camera_shift, self.camera),
+            camera_tilt=tilted(self.camera_tilt),
+        )
 
     def focal(self, photo_width: int) -> float:
         """Focal length in pixels of a photo that wide."""

@@ -28,7 +28,7 @@ Mask = NDArray[np.bool_]
 SCREEN_MARGIN, BLURS = 1.5, 1.5
 # A veil over the ball is told from the table that is mirrored from 1.8 radii on.
 BARE = 1.8
-VEILED = 0.6  # what it must leave of the residuals' cost, where it is strong, to be believed
+VEILED = 0.7  # what it must leave of the residuals' cost to be believed
 
 
 def screen_coordinates(rig: Rig, origin: Array, direction: Array) -> tuple[Array, Array, Mask]:
@@ -162,8 +162,8 @@ def lift_veil(photo: Photo, rig: Rig, ball: Ball) -> Photo:
         seen = veil(p, inside[use]) - mirror * veil(p, outside)
         return np.asarray((seen - extra / spread).ravel())
 
-    def cost(p: Array, weight: Any = 1.0) -> float:
-        return float((np.log1p(off(p) ** 2).reshape(-1, 3) * weight).sum())
+    def cost(p: Array) -> float:
+        return float(np.log1p(off(p) ** 2).sum())
 
     starts = []
     for angle in np.arange(12) * (math.pi / 6):
@@ -177,12 +177,10 @@ def lift_veil(photo: Photo, rig: Rig, ball: Ball) -> Photo:
     bounds = [-2, -2, 0.1, 0, 0, 0], [2, 2, 1, np.inf, np.inf, np.inf]
     p = optimize.least_squares(off, min(starts, key=cost), bounds=bounds, loss="cauchy").x
     strength = veil(p, inside).sum(-1)
-    most = strength[use].max()
-    strong = (strength[use] > most / 2)[:, None]
     # Nor is it believed where it would be stronger than anywhere it can be seen.
     sky = seen & (mirrored[..., 2] > 0)
-    if not cost(p, strong) < VEILED * cost(p * [1, 1, 1, 0, 0, 0], strong) or (
-        strength[sky].max(initial=0) > most
+    if not cost(p) < VEILED * cost(p * [1, 1, 1, 0, 0, 0]) or (
+        strength[sky].max(initial=0) > strength[use].max()
     ):
         return photo
     image = photo.image.copy()

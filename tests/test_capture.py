@@ -11,6 +11,7 @@ from invrender.capture import (
     Capture,
     crop_sample,
     extract_lights,
+    level,
     load_capture,
 )
 from invrender.environments import directions, irradiance
@@ -18,7 +19,7 @@ from invrender.errors import InputError
 from invrender.images import Photo, linear_to_srgb, read_photo, write_exr
 from invrender.mirror import horizon_points, make_ball, mirror_normals, outline_points, place_ball
 from invrender.rig import Rig, write_rig
-from invrender.unfold import fill_environment, trace_ball
+from invrender.unfold import fill_environment, room_irradiance, trace_ball
 
 RIG = Rig()
 SIZE = (720, 960)
@@ -248,6 +249,65 @@ def test_fill_is_exact_for_constant_light_and_smooth():
     np.testing.assert_allclose(filled[:16], 0.7, rtol=1e-6)
     with pytest.raises(InputError, match="nothing but the screen"):
         fill_environment(constant, np.zeros_like(coverage))
+
+
+# --- a camera that does not look straight down ---------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def tilted():
+    """A rig whose camera looks 2.3 degrees past straight down, and its photo."""
+    rig = replace(RIG, camera_tilt=(1.8, -1.4, 0.0))
+    return rig, Photo(photograph(rig, *SIZE, table=grey_table))
+
+
+def found_ball(rig, photo):
+    """Where somebody who does not know of the tilt sees the ball."""
+    truth = make_ball(rig, rig.ball_centre, rig.ball_radius, SIZE)
+    return place_ball(RIG, SIZE, *truth.centre, truth.radius)
+
+
+def test_the_table_is_levelled_about_the_ball(tilted):
+    rig, photo = tilted
+    ball = found_ball(rig, photo)
+    found = level(photo, RIG, ball)
+    np.testing.assert_allclose(found.camera_tilt, rig.camera_tilt, atol=0.5)
+    # The camera sees the ball and the screen where it saw them; only the table is another.
+    centre = np.asarray(ball.position)
+
+    def seen(rig):
+        e_x, e_y = rig.screen_edges
+        corner = rig.screen_corner
+        points = np.array([centre, corner, corner + e_x, corner + e_y])
+        return (points - rig.camera) @ rig.camera_axes.T
+
+    np.testing.assert_allclose(seen(found), seen(RIG), atol=1e-9)
+
+
+def test_a_tilted_camera_leaves_the_light_on_the_table(tilted):
+    rig, photo = tilted
+    height = 64
+    truth = sky(directions(height, 2 * height))
+    truth[height // 2 :] = 0
+    points = RIG.sample_points(3, 3).reshape(-1, 3)
+    true = room_irradiance(rig, points, truth)
+
+    def error(lights):
+        return np.abs(room_irradiance(lights.rig, points, lights.environment) / true - 1).mean()
+
+    ball = found_ball(rig, photo)
+    told = extract_lights(Capture(photo, RIG, PATTERN), ball, height)
+    assert told.fit["camera_tilt"] == pytest.approx(2.3, abs=0.6)
+    # A JPEG's photo has a clipping level, and is taken as straight.
+    straight = extract_lights(Capture(replace(photo, clip_level=1e3), RIG, PATTERN), ball, height)
+    assert straight.fit["camera_tilt"] == 0
+    assert error(told) < 0.5 * error(straight)
+
+
+def test_a_tilt_that_the_rig_tells_is_kept(tilted):
+    rig, photo = tilted
+    ball = make_ball(rig, rig.ball_centre, rig.ball_radius, SIZE)
+    assert level(photo, rig, ball) is rig
 
 
 @pytest.mark.parametrize("tilt", [37.0, 66.0, 120.0])
