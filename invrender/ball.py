@@ -32,6 +32,7 @@ MIN_RADIUS = 10.0  # pixels; below this the pattern in the ball cannot be read
 SEARCH = 3.0  # how many radii from where the rig puts it the ball is looked for
 MIN_CONFIDENCE = 0.5
 SURE = 0.8  # confidence from which no other place is tried
+ALIKE = 0.003  # radii between two balls that count as one
 MIRROR_WEIGHT = 1.0
 OUTLINE_WEIGHT = 0.5  # of the outline beside the horizon: a mirror pales into the table there
 UNSURE = 0.0012  # deviation of the radius, relative, that takes half of `DOUBT` of the confidence
@@ -75,11 +76,13 @@ def find_ball(photo: Photo, rig: Rig, manual: tuple[float, float, float] | None 
     if not climbed:
         raise InputError("no mirror ball found: the photo shows nothing where the rig puts it")
     best, *others = (theta for _, theta in climbed)
-    balls = []
-    # The others serve only where the best one leaves doubt.
-    for theta in (best, *others, best * [1, 1, 0.93], best * [1, 1, 1.07]):
-        balls.append(_settle(photo, view, rig, theta))
-        if balls[-1].confidence > SURE:
+    balls: list[Ball] = []
+    # The others serve only where the best one leaves doubt, until two agree.
+    for theta in (best, best * [1, 1, 0.93], *others, best * [1, 1, 1.07]):
+        found = _settle(photo, view, rig, theta)
+        alike = any(_distance(found, other) < ALIKE for other in balls)
+        balls.append(found)
+        if found.confidence > SURE or alike:
             break
     ball = max(balls, key=lambda b: b.confidence)
     (x, y), r = ball.centre, ball.radius
@@ -108,7 +111,13 @@ def _settle(photo: Photo, view: View, rig: Rig, theta: Array) -> Ball:
     ball = make_ball(rim.rig, np.array([*rim.theta[:2], 0.0]), rim.theta[2], size)
     if is_whole(size, *ball.centre, ball.radius):
         ball = place_ball(rig, size, *ball.centre, ball.radius)
-    return replace(ball, confidence=confidence)
+    return replace(ball, confidence=confidence, camera_tilt=rim.rig.camera_tilt)
+
+
+def _distance(a: Ball, b: Ball) -> float:
+    """How far two balls are apart, of place and radius the larger, in radii."""
+    offset = math.dist(a.centre, b.centre)
+    return max(offset, abs(a.radius - b.radius)) / b.radius
 
 
 def _check_exposure(photo: Photo, ball: Ball) -> None:

@@ -43,6 +43,7 @@ SURE = 0.75  # confidence from which a ball is one even if its pattern fits as b
 # Shift in sizes of the sample, and tilt in degrees, that an error of the ball's place, a hundredth
 # of its radius, cannot explain: a smaller one is taken for such an error.
 MOVED = (0.022, 1.0)
+TILTED = 0.7  # degrees; a smaller tilt of the camera is taken for an error of the rim's fit
 AROUND, FINE = 3.3, 64  # of the table about the ball, radii; pixels to a radius
 
 
@@ -226,13 +227,18 @@ def level(photo: Photo, rig: Rig, ball: Ball) -> Rig:
     A camera that does not look straight down sees the horizon's image off the ball's middle. A
     photo cannot tell a turned camera from a turned table: camera and screen are turned together
     about the ball's centre, so that the ball stays where it is and what the camera sees of the
-    screen too. A tilt that the rig tells is kept; a JPEG's rounding hides the horizon too well.
+    screen too. A tilt that the rig tells is kept, and one below `TILTED` not believed; a JPEG's
+    rounding hides the horizon too well.
     """
     if any(rig.camera_tilt) or photo.clip_level is not None:
         return rig
     centre = np.asarray(ball.position)
-    view = view_around(photo, np.asarray(ball.centre), AROUND * ball.radius, ball.radius / FINE)
-    tilt = fit_rim(view, rig, np.array([*centre[:2], ball.radius_m])).rig.camera_tilt
+    tilt = ball.camera_tilt
+    if tilt is None:
+        view = view_around(photo, np.asarray(ball.centre), AROUND * ball.radius, ball.radius / FINE)
+        tilt = fit_rim(view, rig, np.array([*centre[:2], ball.radius_m])).rig.camera_tilt
+    if np.linalg.norm(tilt) < TILTED:
+        return rig
     return rig.turned(Rotation.from_rotvec(tilt, degrees=True), centre)
 
 

@@ -22,7 +22,8 @@ class Ball:
     ``position`` (3,) and ``radius_m`` in metres, in the rig's coordinates (z = 0). ``centre``
     (x, y) and ``radius`` are those of its outline in pixels (0, 0 is the photo's corner);
     ``ellipse`` is the outline's (centre x, centre y, semi-axis a, semi-axis b, angle of a in
-    degrees from the photo's right towards down). ``confidence`` is in [0, 1].
+    degrees from the photo's right towards down). ``confidence`` is in [0, 1]. ``camera_tilt``: the
+    camera's, degrees as `Rig` has them, where the ball's rim tells it.
     """
 
     position: tuple[float, float, float]
@@ -32,6 +33,7 @@ class Ball:
     radius: float
     ellipse: tuple[float, float, float, float, float]
     confidence: float = 1.0
+    camera_tilt: tuple[float, float, float] | None = None
 
 
 def mirror_normals(rig: Rig, position: Array, radius: float, target: Array, near: bool) -> Array:

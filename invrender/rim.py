@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -84,7 +85,12 @@ def fit_rim(view: View, rig: Rig, theta: Array) -> Rim:
 
 
 def _tilted(rig: Rig, p: Array) -> Rig:
-    return replace(rig, camera_tilt=tuple(np.add(rig.camera_tilt, [*p[_TILT], 0])))
+    return _turned(rig, *p[_TILT])
+
+
+@lru_cache(maxsize=64)
+def _turned(rig: Rig, x: float, y: float) -> Rig:
+    return replace(rig, camera_tilt=tuple(np.add(rig.camera_tilt, [x, y, 0])))
 
 
 @dataclass(frozen=True)
