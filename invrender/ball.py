@@ -64,7 +64,8 @@ def find_ball(photo: Photo, rig: Rig, manual: tuple[float, float, float] | None 
         raise InputError("the rig puts the ball outside the photo: check its lengths and its tilt")
     view = view_around(photo, middle, (SEARCH + 1.5) * expected.radius, expected.radius / 48)
     starts = []
-    for start in _coarse(view, rig, expected):
+    likely = sorted(_coarse(view, rig, expected), key=lambda t: -_score(view, rig, t, 64, 2)[0])
+    for start in likely[:3]:
         theta = _climb(view, rig, start, 2, 0.08, 25)
         starts.append((_score(view, rig, theta, 64, 1)[0], theta))
     starts.sort(key=lambda pair: -pair[0])
