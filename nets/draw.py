@@ -38,6 +38,10 @@ from nets.splitsum import area_resize
 Array = NDArray[np.floating[Any]]
 log = logging.getLogger("invrender")
 
+# Share of real materials with the relief and the roughness of others: there are few, and a network
+# learns them by heart.
+CROSSED = 0.5
+
 HOLDOUT = Path(__file__).with_name("holdout.txt")
 
 
@@ -107,10 +111,13 @@ def draw_material(rng: np.random.Generator, options: Options) -> Maps:
     n = options.size
 
     def one() -> Maps:
-        if real and rng.random() >= options.procedural:
-            jitter = 0.0 if options.split == "holdout" else 1.0
-            return augment(real[rng.integers(len(real))], rng, n, n, jitter=jitter)
-        return procedural_material(int(rng.integers(2**62)), n, n)
+        if not real or rng.random() < options.procedural:
+            return procedural_material(int(rng.integers(2**62)), n, n)
+        if options.split == "holdout":
+            return augment(real[rng.integers(len(real))], rng, n, n, jitter=0.0)
+        crossed = rng.random() < CROSSED
+        a, b, c = (augment(real[i], rng, n, n) for i in rng.integers(len(real), size=3))
+        return replace(a, normal=b.normal, roughness=c.roughness) if crossed else a
 
     for _ in range(20):
         maps = one()
