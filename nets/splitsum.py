@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
+from kornia.geometry.transform import remap
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.signal import fftconvolve
@@ -216,8 +217,11 @@ def look_up_sky(sky: Tensor, direction: Tensor) -> Tensor:
 def sample(image: Tensor, position: Tensor, padding: str = "border") -> Tensor:
     """Bilinear look-up of (B, C, h, w) at (B, 2, H, W) in [-1, 1]², x right and y up."""
     # Torch's backward pass writes out of bounds where a coordinate is NaN.
-    grid = torch.nan_to_num(torch.stack([position[:, 0], -position[:, 1]], -1)).clamp(-1e3, 1e3)
-    return F.grid_sample(image, grid, padding_mode=padding, align_corners=False)
+    at = torch.nan_to_num(position).clamp(-1e3, 1e3)
+    return remap(
+        image, at[:, 0], -at[:, 1],
+        padding_mode=padding, align_corners=False, normalized_coordinates=True,
+    )  # fmt: skip
 
 
 def hit_screen(position: Tensor, direction: Tensor, rig: Tensor) -> Tensor:
