@@ -3,29 +3,33 @@
     python benchmarks/refine.py [--quick] --out DIR [--materials DIR --envs DIR]
 
 Whole photographs are path-traced (`refine_captures`) and every capture is refined from its photo
-alone, with estimated lights; from the network's maps and, beside it, from a flat start. Captures
-are kept in DIR/captures: a rerun only refines. Without folders, materials and rooms are procedural.
+alone, with estimated lights; from the network's maps and, beside it, from a flat start. What the
+estimate costs is told by the network's start with the true lights. Captures are kept in
+DIR/captures: a rerun only refines. Without folders, materials and rooms are procedural.
 """
 
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from common import bar, markdown, write_results
 from matplotlib import pyplot as plt
-from refine_captures import arguments, make_captures
+from refine_captures import arguments, make_captures, true_lights
 
+from invrender.capture import crop_mask, crop_sample
 from invrender.maps import NAMES, Maps, map_errors
 from invrender.materials import resize_maps
-from invrender.pipeline import POOR_FIT, Stages, coarse_error, recover, see
+from invrender.pipeline import POOR_FIT, Seen, Stages, coarse_error, recover, see
 from invrender.relight import rerender
 from invrender.render import picture
 from invrender.results import deviations
 
-INITS = ("network", "flat")
+TRUE = "network, true lights"
+INITS = ("network", "flat", TRUE)
 SURE = 0.68  # of a Gaussian within one sigma
 
 
@@ -45,11 +49,20 @@ def coverage(maps: Maps, truth: Maps, sigma: dict[str, Any]) -> dict[str, float]
     return shares
 
 
+def relit(folder: Path, size: int, seen: Seen) -> Seen:
+    """The capture with its true lights, and the crop of the true rig."""
+    photo, lights = seen.capture.photo, true_lights(folder, seen.capture)
+    crop = crop_sample(photo, lights.rig, size)
+    return replace(seen, lights=lights, photo=crop, clipped=crop_mask(photo, lights.rig, size))
+
+
 def measure(folder: Path, size: int, init: str) -> dict[str, Any]:
     """Refine a capture and compare with its truth."""
     stage = Stages()
     cpu = time.process_time()
     seen = see(folder, size, stage)
+    if init == TRUE:
+        seen, init = relit(folder, size, seen), "network"
     start, result, shots = recover([seen], stage, init=init)
     cpu = time.process_time() - cpu
     assert seen.capture.truth is not None
@@ -58,6 +71,7 @@ def measure(folder: Path, size: int, init: str) -> dict[str, Any]:
     shares = coverage(result.maps, truth, deviations(result.sigma))
     row: dict[str, Any] = {
         "capture": folder.name,
+        "jpeg": seen.capture.photo.clip_level is not None,
         "seconds_initial": done - stage.seconds["refine"] - stage.seconds.get("materials", 0.0),
         "seconds_refined": done,
         "processor_seconds": cpu,
@@ -107,6 +121,17 @@ def summarise(rows: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
+def lights_cost(results: dict[str, list[dict[str, Any]]]) -> str:
+    """Average map RMSE with the lights found and with the true ones."""
+    table = []
+    for name, kinds in (("all", (False, True)), ("HDR", (False,)), ("JPEG", (True,))):
+        some = [[r for r in results[i] if r["jpeg"] in kinds] for i in ("network", TRUE)]
+        if some[0]:
+            found, true = (pooled(rows, "average_refined") for rows in some)
+            table.append([name, found, true, found / true])
+    return markdown(["average map RMSE", "lights found", "true lights", "ratio"], table)
+
+
 def bars(summary: dict[str, Any]) -> list[dict[str, Any]]:
     """The bars of refining the network's maps."""
     ratio = {n: after / before for n, (before, after) in summary["errors"].items()}
@@ -125,7 +150,7 @@ def plot(results: dict[str, list[dict[str, Any]]], file: Path) -> None:
     """Map and re-render error against run time: a thin line a capture, a thick one for all."""
     figure, axes = plt.subplots(1, 2, figsize=(10, 4))
     for axis, name in zip(axes, ("average", "rerender"), strict=True):
-        for colour, (init, rows) in zip(("C0", "C1"), results.items(), strict=False):
+        for colour, (init, rows) in zip(("C0", "C1", "C2"), results.items(), strict=False):
             for row in rows:
                 x = [row["seconds_initial"], row["seconds_refined"]]
                 axis.plot(x, [row[f"{name}_{w}"] for w in ("initial", "refined")], colour, lw=0.4)
@@ -161,7 +186,7 @@ def main() -> None:
             )
     summaries = {init: summarise(rows) for init, rows in results.items()}
     plot(results, args.out / "refine.png")
-    text = []
+    text = [lights_cost(results)] if {"network", TRUE} <= set(results) else []
     for init, s in summaries.items():
         table = [[n, *e, e[1] / e[0], s["coverage"].get(n, "")] for n, e in s["errors"].items()]
         header = [f"RMSE, {init}", "initial", "refined", "ratio", "within one sigma"]

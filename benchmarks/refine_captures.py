@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from invrender.capture import Capture, Lights
 from invrender.environments import (
     find_environments,
     procedural_environment,
@@ -35,7 +36,7 @@ from invrender.materials import (
     turn_maps,
 )
 from invrender.pattern import default_pattern
-from invrender.rig import Rig
+from invrender.rig import Rig, read_rig
 from invrender.simulate import simulate
 
 Array = NDArray[np.floating[Any]]
@@ -131,6 +132,17 @@ def make_capture(
         if quality:
             to_jpeg(new, quality, GAIN * float(shown.max()))
         os.replace(new, folder)
+
+
+def true_lights(folder: Path, capture: Capture) -> Lights:
+    """The lights that such a capture was simulated with, in its photo's unit."""
+    assert capture.true_environment is not None
+    room = np.asarray(capture.true_environment, np.float32)
+    gain = GAIN if capture.photo.clip_level is None else 1 / float(capture.pattern.max())
+    rig, _ = read_rig(folder / "truth" / "rig.toml")
+    shown = capture.pattern * np.float32(gain)
+    seen = np.ones(room.shape[:2], np.float32)
+    return Lights(room, seen, capture.pattern, np.full(3, gain, np.float32), shown, rig)
 
 
 def _material(folders: list[Path], k: int, size: int) -> Maps:

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from invrender.ball_view import view_around
 from invrender.clipped import raise_clipped
 from invrender.errors import InputError
+from invrender.hidden import add_hidden_lamp
 from invrender.images import PHOTOS, Photo, read_image, read_photo
 from invrender.maps import Maps, read_maps
 from invrender.mirror import Ball
@@ -43,7 +44,7 @@ SURE = 0.75  # confidence from which a ball is one even if its pattern fits as b
 # Shift in sizes of the sample, and tilt in degrees, that an error of the ball's place, a hundredth
 # of its radius, cannot explain: a smaller one is taken for such an error.
 MOVED = (0.022, 1.0)
-TILTED = 0.7  # degrees; a smaller tilt of the camera is taken for an error of the rim's fit
+TILTED = 1.1  # degrees; a smaller tilt of the camera is taken for an error of the rim's fit
 AROUND, FINE = 3.3, 64  # of the table about the ball, radii; pixels to a radius
 
 
@@ -73,7 +74,8 @@ class Lights:
     ``gamma`` the exponent on the pattern that fits best (1: as it should be; the gain is for 1),
     ``blur`` the camera's in pixels, ``pixels`` the number used, ``saturated`` and
     ``room_saturated`` the shares of screen and room in the ball that are saturated,
-    ``room_raised`` how many times brighter the saturated lamps were made,
+    ``room_raised`` how many times brighter the saturated lamps were made, ``hidden_lamp`` how many
+    times brighter than the filling a part of the room behind the screen was made (1: none),
     ``pattern_residual`` the residual before the screen's pose and curve were fitted,
     ``camera_tilt`` how far the camera is found to look past straight down, in degrees. Where the
     pattern as it should be fits badly, ``pattern`` is as the display really shows it, and ``rig``
@@ -278,7 +280,9 @@ def extract_lights(capture: Capture, ball: Ball, height: int = 128) -> Lights:
     environment, fit["room_raised"] = raise_clipped(
         photo, rig, ball, pattern, gain, environment, coverage
     )
-    environment = fill_environment(environment, coverage)
+    environment, fit["hidden_lamp"] = add_hidden_lamp(
+        photo, rig, ball, pattern, gain, fill_environment(environment, coverage), coverage
+    )
     captured = unfold_pattern(photo, rig, ball, min(256, max(pattern.shape[:2])))
     return Lights(environment, coverage, pattern, gain, captured, rig, fit)
 
@@ -305,6 +309,11 @@ def light_warnings(lights: Lights) -> list[str]:
             f"{fit['room_saturated']:.1%} of the room is saturated in the ball; it was made "
             f"{fit.get('room_raised', 1):.1f} times brighter, as the table's shading suggests: "
             "expose shorter, or take a raw photo, to know"
+        )
+    if fit.get("hidden_lamp", 1) > 1:
+        warnings.append(
+            "the table's shading tells of a lamp behind the screen, which the ball does not show; "
+            "it was made as bright as that suggests: turn the rig, or the lamp off, to know"
         )
     if fit.get("pattern_residual", 0) > NO_PATTERN:
         warnings.append(

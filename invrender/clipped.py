@@ -39,7 +39,7 @@ BRIGHTEST = 6.0  # the greatest such logarithm
 ROUGH = 0.02
 MIN_PAIRS = 50
 # Axes of a residual in log RGB: what all channels share, and two of its colour.
-_AXES = np.array([[1, 1, 1], [1, -1, 0], [1, 1, -2]]).T / np.sqrt([3, 2, 6])
+AXES = np.array([[1, 1, 1], [1, -1, 0], [1, 1, -2]]).T / np.sqrt([3, 2, 6])
 
 
 def clipped_share(photo: Photo, rig: Rig, ball: Ball, height: int) -> Array:
@@ -70,7 +70,7 @@ def raise_clipped(
         return environment, 1.0
     assert photo.clip_level is not None
     extra = np.asarray(share * photo.clip_level / np.asarray(rig.ball_reflectance), np.float32)
-    seen, points, use = _table(photo, rig, ball)
+    seen, points, use = table_blocks(photo, rig, ball)
     at = points[use]
     cells = resize_pattern(pattern, CELLS) * gain
     screen = np.einsum("nij,ijc->nc", rig.screen_cosines(at, CELLS), cells)
@@ -81,7 +81,7 @@ def raise_clipped(
     return np.asarray(raised, np.float32), float(factor.mean())
 
 
-def _table(photo: Photo, rig: Rig, ball: Ball) -> tuple[Array, Array, Mask]:
+def table_blocks(photo: Photo, rig: Rig, ball: Ball) -> tuple[Array, Array, Mask]:
     """The photo's blocks: mean radiance (h, w, 3), point of the table (h, w, 3), and which show it.
 
     Sample, ball, its contact shadow and saturated blocks do not count.
@@ -108,24 +108,31 @@ def _table(photo: Photo, rig: Rig, ball: Ball) -> tuple[Array, Array, Mask]:
     return mean, points, use
 
 
+def distant_pairs(use: Mask) -> list[tuple[tuple[Any, Any], int]]:
+    """Pairs of used blocks, as indices among these, each of `LAGS` apart down and across: those of
+    one lag and way, and the lag. Too few pairs do not count."""
+    index = np.full(use.shape, -1)
+    index[use] = np.arange(use.sum())
+    pairs = []
+    for lag in LAGS:
+        for first, second in ((index[lag:], index[:-lag]), (index[:, lag:], index[:, :-lag])):
+            both = (first >= 0) & (second >= 0)
+            if both.sum() >= MIN_PAIRS:
+                pairs.append(((first[both], second[both]), lag))
+    return pairs
+
+
 def _excess(seen: Array, use: Mask, known: Array, extra: Array) -> Array:
     """Logarithms (3,) of the clipped light's factor.
 
     ``seen``: log radiance of the used blocks (n, 3); irradiance is known + (factor - 1)·extra.
     """
-    index = np.full(use.shape, -1)
-    index[use] = np.arange(len(seen))
-    pairs, weights = [], []
-    for lag in LAGS:
-        for first, second in ((index[lag:], index[:-lag]), (index[:, lag:], index[:, :-lag])):
-            both = (first >= 0) & (second >= 0)
-            if both.sum() >= MIN_PAIRS:
-                pairs.append((first[both], second[both]))
-                # Textures are alike over several blocks: so many pairs count as one.
-                weights.append(1 / lag)
+    pairs = [pair for pair, _ in distant_pairs(use)]
+    # Textures are alike over several blocks: so many pairs count as one.
+    weights = [1 / lag for _, lag in distant_pairs(use)]
 
     def steps(log: Array) -> list[Array]:
-        return [(log[i] - log[j]) @ _AXES for i, j in pairs]
+        return [(log[i] - log[j]) @ AXES for i, j in pairs]
 
     wanted = steps(seen)
 

@@ -1,4 +1,4 @@
-"""Clipped lamps come out as bright as the shading of the table says."""
+"""Lamps that are clipped, or hidden by the screen, are as bright as the table's shading says."""
 
 from dataclasses import replace
 
@@ -9,12 +9,14 @@ from synthetic_photo import blocks, grey_table, light_from, photograph, sky, tex
 
 from invrender.clipped import raise_clipped
 from invrender.environments import directions, irradiance, solid_angles
+from invrender.hidden import add_hidden_lamp
 from invrender.images import Photo
 from invrender.mirror import make_ball
 from invrender.rig import Rig
 from invrender.unfold import (
     fill_environment,
     hidden_by_screen,
+    room_irradiance,
     screen_coordinates,
     unfold_environment,
 )
@@ -36,8 +38,19 @@ def room(d):
     return 1.2 * sky(d)
 
 
+def hidden_lamp(d):
+    """A dim room with a lamp that the screen hides from the ball but not from the table."""
+    to_lamp = np.array([-0.3, 0.55, 1.0])
+    near = d @ (to_lamp / np.linalg.norm(to_lamp))
+    return 0.3 * sky(d) + 100 * np.exp((near - 1) / 0.004)[..., None] * np.array([1.0, 0.9, 0.7])
+
+
 @pytest.fixture(scope="module")
 def light():
+    return table_light(room)
+
+
+def table_light(room):
     """Irradiance (25, 33, 3) of the table within 0.15 m of the sample, by brute force."""
     d = directions(64, 128)[:32].reshape(-1, 3).astype(float)
     weight = np.repeat(solid_angles(64, 128)[:32], 128) * d[:, 2]
@@ -48,7 +61,7 @@ def light():
     return out
 
 
-def picture(light, albedo):
+def picture(light, albedo, room=room):
     """The photo with a Lambertian table, clipped, and what the ball shows of the room."""
 
     def table(point):
@@ -86,6 +99,32 @@ def test_nothing_clipped_nothing_raised(light):
     for whole in (replace(photo, clip_level=None), replace(photo, clip_level=2.0)):
         found = raise_clipped(whole, RIG, BALL, PATTERN, GAIN, environment, coverage)
         assert found[0] is environment and found[1] == 1
+
+
+def test_the_table_tells_of_a_lamp_behind_the_screen():
+    photo, environment, coverage = picture(table_light(hidden_lamp), plain_table, hidden_lamp)
+    photo = replace(photo, clip_level=None)
+    filled = fill_environment(environment, coverage)
+    found, times = add_hidden_lamp(photo, RIG, BALL, PATTERN, GAIN, filled, coverage)
+    assert times > 20
+    np.testing.assert_array_equal(found[coverage > 0], environment[coverage > 0])
+    truth = hidden_lamp(directions(64, 128).astype(float))
+    truth[32:] = 0
+    points = RIG.sample_points(3, 3).reshape(-1, 3)
+    dim, new, true = (room_irradiance(RIG, points, e) for e in (filled, found, truth))
+    assert np.abs(dim - true).mean() > 0.5 * true.mean()
+    assert np.abs(new - true).mean() < 0.3 * np.abs(dim - true).mean()
+
+
+@pytest.mark.parametrize("albedo", [plain_table, grey_table, textured_table])
+def test_no_lamp_behind_the_screen_where_there_is_none(light, albedo):
+    """Nor in a JPEG, nor where the table is black."""
+    photo, environment, coverage = picture(light, albedo)
+    filled = fill_environment(environment, coverage)
+    whole = replace(photo, clip_level=None)
+    for some in (whole, photo, replace(whole, image=0 * photo.image)):
+        found, times = add_hidden_lamp(some, RIG, BALL, PATTERN, GAIN, filled, coverage)
+        assert found is filled and times == 1
 
 
 @pytest.mark.parametrize("table", [0.0, 1e-6, 0.94, 1.0])
