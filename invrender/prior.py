@@ -22,7 +22,7 @@ MIN_ROUGHNESS = 0.03
 MAX_SLOPE = 3.0  # 72 degrees
 # By how much errors exceed what the networks expect, in the order of θ, where lights are estimated:
 # benchmarks/refine_calibrate.py, with the weights in the package.
-UNTOLD = np.array([2.15] * 3 + [1.6] * 3 + [1.1] + [1.4] * 2, np.float32)
+UNTOLD = np.array([1.95] * 3 + [1.2] * 3 + [1.05] + [1.35] * 2, np.float32)
 
 
 @dataclass
@@ -54,8 +54,8 @@ def network_prior(maps: Maps, sigma: dict[str, Array]) -> Prior:
     """The uncertainty of a network's maps, from what it expects of its errors, (H, W) a map.
 
     ``sigma`` of normals is that of n/2 + 1/2. An albedo's error within a material is at most a
-    share of it; the total error is `UNTOLD` times what the network expects, and no step is made
-    with more.
+    share of it. The total error is `UNTOLD` times what the network expects; a step is made with
+    the same part of each, so that none grows by it.
     """
     mean = to_theta(maps)
     told = np.empty_like(mean)
@@ -64,7 +64,7 @@ def network_prior(maps: Maps, sigma: dict[str, Array]) -> Prior:
     told[..., N] = 2 * sigma["normal"][..., None]
     told = np.maximum(told, 1e-4)
     total = UNTOLD * told
-    spread = np.minimum(told, total)
+    spread = total / UNTOLD.max()
     spread[..., D] = np.minimum(spread[..., D], 0.01 + 0.15 * maps.diffuse)
     spread[..., S] = np.minimum(spread[..., S], 0.01 + 0.3 * maps.specular)
     return Prior(mean, spread, _correlation(0.9, 0.95), total)
