@@ -31,7 +31,7 @@ BRIGHTER, COLOUR = 0.3, 0.12
 BRIGHTEST = 9.0  # the greatest such logarithm
 LAMPS = (0.1, 0.4, 1.5)  # of the table's light: of a lamp to start from
 WORTH = 6.0  # by how much, twice the log posterior, it must be likelier with a lamp
-LEFT = 0.85  # of the table's usual differences in brightness, what a lamp must leave unexplained
+LEFT = 0.82  # of the table's usual differences in brightness, what a lamp must leave unexplained
 
 
 def add_hidden_lamp(
