@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from invrender.ball_view import view_around
 from invrender.clipped import raise_clipped
 from invrender.errors import InputError
 from invrender.hidden import add_hidden_lamp
@@ -20,7 +19,6 @@ from invrender.images import PHOTOS, Photo, read_image, read_photo
 from invrender.maps import Maps, read_maps
 from invrender.mirror import Ball
 from invrender.rig import Rig, read_rig
-from invrender.rim import fit_rim
 from invrender.screen import SATURATED, fit_screen
 from invrender.unfold import (
     fill_environment,
@@ -45,7 +43,6 @@ SURE = 0.75  # confidence from which a ball is one even if its pattern fits as b
 # of its radius, cannot explain: a smaller one is taken for such an error.
 MOVED = (0.022, 1.0)
 TILTED = 1.1  # degrees; a smaller tilt of the camera is taken for an error of the rim's fit
-AROUND, FINE = 3.3, 64  # of the table about the ball, radii; pixels to a radius
 
 
 @dataclass(frozen=True)
@@ -234,14 +231,10 @@ def level(photo: Photo, rig: Rig, ball: Ball) -> Rig:
     """
     if any(rig.camera_tilt) or photo.clip_level is not None:
         return rig
-    centre = np.asarray(ball.position)
-    tilt = ball.camera_tilt
-    if tilt is None:
-        view = view_around(photo, np.asarray(ball.centre), AROUND * ball.radius, ball.radius / FINE)
-        tilt = fit_rim(view, rig, np.array([*centre[:2], ball.radius_m])).rig.camera_tilt
+    tilt = ball.camera_tilt or (0.0, 0.0, 0.0)
     if np.linalg.norm(tilt) < TILTED:
         return rig
-    return rig.turned(Rotation.from_rotvec(tilt, degrees=True), centre)
+    return rig.turned(Rotation.from_rotvec(tilt, degrees=True), np.asarray(ball.position))
 
 
 def extract_lights(capture: Capture, ball: Ball, height: int = 128) -> Lights:

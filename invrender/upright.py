@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from invrender.ball import find_ball
 from invrender.capture import Capture, not_the_pattern
@@ -139,9 +140,13 @@ def _turned(capture: Capture, ball: Ball, turns: int) -> tuple[Photo, Ball | Non
     x, y = {1: (y, w - x), 2: (w - x, h - y), 3: (h - y, x)}[turns % 4]
     rig = _turned_rig(capture.rig, ball.size, turns)
     try:
-        return photo, place_ball(rig, (photo.height, photo.width), x, y, ball.radius)
+        moved = place_ball(rig, (photo.height, photo.width), x, y, ball.radius)
     except InputError:
         return photo, None
+    if ball.camera_tilt is None:
+        return photo, moved
+    tilt = Rotation.from_euler("z", 90 * turns, degrees=True).apply(ball.camera_tilt)
+    return photo, replace(moved, camera_tilt=tuple(tilt.tolist()))
 
 
 def _likeness(seen: Array, shown: Array) -> float:

@@ -20,6 +20,7 @@ from invrender.images import Photo, linear_to_srgb, read_photo, write_exr
 from invrender.mirror import horizon_points, make_ball, mirror_normals, outline_points, place_ball
 from invrender.rig import Rig, write_rig
 from invrender.unfold import fill_environment, room_irradiance, trace_ball
+from invrender.upright import find_upright_ball
 
 RIG = Rig()
 SIZE = (720, 960)
@@ -261,15 +262,9 @@ def tilted():
     return rig, Photo(photograph(rig, *SIZE, table=grey_table))
 
 
-def found_ball(rig, photo):
-    """Where somebody who does not know of the tilt sees the ball."""
-    truth = make_ball(rig, rig.ball_centre, rig.ball_radius, SIZE)
-    return place_ball(RIG, SIZE, *truth.centre, truth.radius)
-
-
 def test_the_table_is_levelled_about_the_ball(tilted):
     rig, photo = tilted
-    ball = found_ball(rig, photo)
+    ball = find_ball(photo, RIG)
     found = level(photo, RIG, ball)
     np.testing.assert_allclose(found.camera_tilt, rig.camera_tilt, atol=0.5)
     # The camera sees the ball and the screen where it saw them; only the table is another.
@@ -295,13 +290,22 @@ def test_a_tilted_camera_leaves_the_light_on_the_table(tilted):
     def error(lights):
         return np.abs(room_irradiance(lights.rig, points, lights.environment) / true - 1).mean()
 
-    ball = found_ball(rig, photo)
+    ball = find_ball(photo, RIG)
     told = extract_lights(Capture(photo, RIG, PATTERN), ball, height)
     assert told.fit["camera_tilt"] == pytest.approx(2.3, abs=0.6)
     # A JPEG's photo has a clipping level, and is taken as straight.
     straight = extract_lights(Capture(replace(photo, clip_level=1e3), RIG, PATTERN), ball, height)
     assert straight.fit["camera_tilt"] == 0
     assert error(told) < 0.5 * error(straight)
+
+
+def test_the_tilt_turns_with_the_photo(tilted):
+    """A photo of which it is not known which side is up is levelled as well."""
+    rig, photo = tilted
+    turned = Capture(Photo(np.rot90(photo.image, -1)), RIG, PATTERN)
+    _, ball, told = find_upright_ball(turned)
+    assert told and ball.size == SIZE
+    np.testing.assert_allclose(ball.camera_tilt, rig.camera_tilt, atol=0.5)
 
 
 def test_a_tilt_that_the_rig_tells_is_kept(tilted):
