@@ -167,7 +167,7 @@ def main() -> None:
     parser = arguments(__doc__, "two small captures, under a minute", 24)
     parser.add_argument("--init", choices=INITS, action="append", help="only this start")
     args = parser.parse_args()
-    count, size, width, spp = (2, 96, 480, 8) if args.quick else (args.count, 256, 960, 32)
+    count, size, width, spp = (2, 96, 720, 24) if args.quick else (args.count, 256, 960, 32)
     folders = make_captures(
         args.out / "captures", count, size, width, spp, args.materials, args.envs
     )
