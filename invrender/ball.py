@@ -31,7 +31,7 @@ RADIUS_PRIOR = 0.10  # how far the ball's radius in pixels may be from what the 
 MIN_RADIUS = 10.0  # pixels; below this the pattern in the ball cannot be read
 SEARCH = 3.0  # how many radii from where the rig puts it the ball is looked for
 MIN_CONFIDENCE = 0.5
-SURE = 0.8  # confidence from which no other place is tried
+SURE, LIKELY = 0.8, 0.65  # confidences from which no other place is tried; where two agree
 ALIKE = 0.003  # radii between two balls that count as one
 MIRROR_WEIGHT = 1.0
 OUTLINE_WEIGHT = 0.5  # of the outline beside the horizon: a mirror pales into the table there
@@ -78,12 +78,12 @@ def find_ball(photo: Photo, rig: Rig, manual: tuple[float, float, float] | None 
         raise InputError("no mirror ball found: the photo shows nothing where the rig puts it")
     best, *others = (theta for _, theta in climbed)
     balls: list[Ball] = []
-    # The others serve only where the best one leaves doubt, until two agree.
+    # The others serve only where the best one leaves doubt.
     for theta in (best, best * [1, 1, 0.93], *others, best * [1, 1, 1.07]):
         found = _settle(photo, view, rig, theta)
         alike = any(_distance(found, other) < ALIKE for other in balls)
         balls.append(found)
-        if found.confidence > SURE or alike:
+        if found.confidence > (LIKELY if alike else SURE):
             break
     ball = max(balls, key=lambda b: b.confidence)
     (x, y), r = ball.centre, ball.radius
