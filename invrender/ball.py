@@ -10,6 +10,7 @@ of the image can be predicted, and no coin or printed circle passes that test.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -68,19 +69,23 @@ def find_ball(photo: Photo, rig: Rig, manual: tuple[float, float, float] | None 
     for start in likely[:3]:
         theta = _climb(view, rig, start, 2, 0.08, 25)
         starts.append((_score(view, rig, theta, 64, 1)[0], theta))
-    starts.sort(key=lambda pair: -pair[0])
-    climbed = []
-    for _, start in starts[:2]:
-        theta = _climb(view, rig, _climb(view, rig, start, 1, 0.04, 40), 0, 0.02, 40)
-        climbed.append((_score(view, rig, theta)[0], theta))
-    climbed.sort(key=lambda pair: -pair[0])
-    if not climbed:
+    if not starts:
         raise InputError("no mirror ball found: the photo shows nothing where the rig puts it")
-    best, *others = (theta for _, theta in climbed)
+    starts.sort(key=lambda pair: -pair[0])
+
+    def places() -> Iterator[Array]:
+        best, *other = (theta for _, theta in starts[:2])
+        best = _climb(view, rig, _climb(view, rig, best, 1, 0.04, 40), 0, 0.02, 40)
+        yield best
+        # The others serve only where the best one leaves doubt.
+        yield best * [1, 1, 0.93]
+        for theta in other:
+            yield _climb(view, rig, _climb(view, rig, theta, 1, 0.04, 40), 0, 0.02, 40)
+        yield best * [1, 1, 1.07]
+
     balls: list[Ball] = []
-    # The others serve only where the best one leaves doubt.
-    for theta in (best, best * [1, 1, 0.93], *others, best * [1, 1, 1.07]):
-        found = _settle(photo, view, rig, theta)
+    for theta in places():
+        found = _settle(photo, view, rig, theta, thorough=bool(balls))
         alike = any(_distance(found, other) < ALIKE for other in balls)
         balls.append(found)
         if found.confidence > (LIKELY if alike else SURE):
@@ -98,7 +103,7 @@ def find_ball(photo: Photo, rig: Rig, manual: tuple[float, float, float] | None 
     return ball
 
 
-def _settle(photo: Photo, view: View, rig: Rig, theta: Array) -> Ball:
+def _settle(photo: Photo, view: View, rig: Rig, theta: Array, thorough: bool) -> Ball:
     """The ball near ``theta`` by its rim, with the confidence in it.
 
     The ball is the one that the untilted camera would see like that.
@@ -106,7 +111,7 @@ def _settle(photo: Photo, view: View, rig: Rig, theta: Array) -> Ball:
     size = (photo.height, photo.width)
     found = make_ball(rig, np.array([theta[0], theta[1], 0.0]), theta[2], size)
     fine = view_around(photo, np.asarray(found.centre), 3.3 * found.radius, found.radius / FINE)
-    rim = fit_rim(fine, rig, theta)
+    rim = fit_rim(fine, rig, theta, thorough)
     doubt = DOUBT / (1 + (UNSURE / max(rim.deviation, 1e-9)) ** 2)
     confidence = _confidence(view, rim.rig, rim.theta) * (1 - doubt)
     ball = make_ball(rim.rig, np.array([*rim.theta[:2], 0.0]), rim.theta[2], size)

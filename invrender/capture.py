@@ -184,13 +184,14 @@ def crop_sample(photo: Photo, rig: Rig, size: int = 256) -> Array:
 
 def crop_mask(photo: Photo, rig: Rig, size: int) -> NDArray[np.bool_]:
     """(size, size): pixels of the sample's crop that a saturated photo pixel touches."""
-    if not photo.clipped.any():
-        return np.zeros((size, size), bool)
     corners = sample_corners(photo, rig).reshape(-1, 2)
     x0, y0 = np.maximum(np.floor(corners.min(0)).astype(int) - 10, 0)
     x1, y1 = np.ceil(corners.max(0)).astype(int) + 10
-    mask = np.zeros((*photo.clipped.shape, 3), np.float32)
-    mask[y0:y1, x0:x1] = ndimage.maximum_filter(photo.clipped[y0:y1, x0:x1], 3)[..., None]
+    clipped = photo.clipped
+    if not clipped[y0:y1, x0:x1].any():
+        return np.zeros((size, size), bool)
+    mask = np.zeros((*clipped.shape, 3), np.float32)
+    mask[y0:y1, x0:x1] = ndimage.maximum_filter(clipped[y0:y1, x0:x1], 3)[..., None]
     return crop_sample(Photo(mask), rig, size)[..., 0] > 0.05
 
 

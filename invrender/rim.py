@@ -39,6 +39,7 @@ STAGES = (
     (64, 1.0, 1.15, 6, (1.0,)),
     (144, 0.0, 1.25, 10, (1.0,)),
 )
+LIKELIEST = 2  # of a stage's starts, where the fit is not thorough
 LUMA = (0.2126, 0.7152, 0.0722)  # a JPEG has its colours at half the resolution
 # The unknowns: x, y, radius in metres; the camera's tilt in degrees about x and y; the logarithms
 # of its blur in the view's pixels and of the mirror's reflectance over the rig's.
@@ -65,12 +66,13 @@ class Rim:
     deviation: float
 
 
-def fit_rim(view: View, rig: Rig, theta: Array) -> Rim:
+def fit_rim(view: View, rig: Rig, theta: Array, thorough: bool = True) -> Rim:
     """The ball near ``theta``: x, y, radius in metres, some hundredths of the radius off.
 
     ``view``: the photo out to about three radii, the ball some 60 pixels in radius. Levenberg's and
     Marquardt's steps, coarse to fine, with Cauchy's weights on the lines' residuals and on the
-    distances from the horizon to the strongest edges near it.
+    distances from the horizon to the strongest edges near it. ``thorough``: from all of a stage's
+    starts, not only from those that fit best as they are.
     """
     p = np.array([*theta, 0.0, 0.0, math.log(USUAL_BLUR), 0.0])
     light = _mend(view.image @ np.array(LUMA))
@@ -78,6 +80,9 @@ def fit_rim(view: View, rig: Rig, theta: Array) -> Rim:
         lines = _Lines(view, light, rig, p, count, blur, limit)
         starts = [p * [1, 1, k, 1, 1, 1, 1] for k in scales]
         spread, edge = np.min([lines.spreads(q) for q in starts], axis=0)
+        if not thorough:
+            costs = [lines.solve(q, spread, edge, None).cost for q in starts]
+            starts = [starts[i] for i in np.argsort(costs)[:LIKELIEST]]
         found = [lines.descend(q, turns, spread, edge) for q in starts]
         _, p, information = min(found, key=lambda f: f[0])
     spread = math.sqrt(np.linalg.inv(information)[2, 2])

@@ -175,7 +175,8 @@ def lift_veil(photo: Photo, rig: Rig, ball: Ball) -> Photo:
     if not starts:
         return photo
     bounds = [-2, -2, 0.1, 0, 0, 0], [2, 2, 1, np.inf, np.inf, np.inf]
-    p = optimize.least_squares(off, min(starts, key=cost), bounds=bounds, loss="cauchy").x
+    start = min(starts, key=cost)
+    p = optimize.least_squares(off, start, bounds=bounds, loss="cauchy", ftol=1e-6).x
     strength = veil(p, inside).sum(-1)
     # Nor is it believed where it would be stronger than anywhere it can be seen.
     sky = seen & (mirrored[..., 2] > 0)
