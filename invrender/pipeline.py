@@ -183,10 +183,12 @@ def recover(
             ]  # fmt: skip
         starts = [e.maps for e in estimates]
         with stage("refine"):
-            estimates = [
-                improve(s.photo, s.prepared, e, s.clipped, samples, keep, told("refine"))
-                for s, e in zip(shots, estimates, strict=True)
-            ]
+            for i, s in enumerate(shots):
+                estimates[i] = improve(
+                    s.photo, s.prepared, estimates[i], s.clipped, samples, keep, told("refine")
+                )
+                if estimates[i].interrupted:
+                    break
         turns = [0] + [find_turn(m, starts[0]) for m in starts[1:]]
         priors = [
             network_prior(turn_maps(e.maps, -k), {n: np.rot90(x, -k) for n, x in e.sigma.items()})

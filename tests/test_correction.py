@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from invrender.cli import EXAMPLE  # noqa: E402
 from invrender.lobes import fit_lobes  # noqa: E402
 from invrender.maps import constant_maps  # noqa: E402
 from invrender.pattern import block_pattern  # noqa: E402
-from invrender.pipeline import refine_capture  # noqa: E402
+from invrender.pipeline import Stages, recover, refine_capture, see  # noqa: E402
 from invrender.render import material_from_maps, prepare, radiance  # noqa: E402
 from invrender.rig import Rig  # noqa: E402
 from invrender.scene import make_scene, make_view  # noqa: E402
@@ -21,7 +22,7 @@ from nets.correction import (  # noqa: E402
     features,
     gauss_newton,
 )
-from nets.infer import Corrector, Estimate, linearised  # noqa: E402
+from nets.infer import Corrector, Estimate, Reconstructor, linearised  # noqa: E402
 from nets.loader import positions  # noqa: E402
 from nets.store import build, load_weights, save_weights  # noqa: E402
 
@@ -221,6 +222,20 @@ def test_an_interrupted_run_leaves_the_best_and_goes_on(tmp_path, monkeypatch):
     refine_capture(EXAMPLE, tmp_path / "fresh", size=24)
     fresh = json.loads((tmp_path / "fresh" / "report.json").read_text())
     assert again["map_error"]["refined"] == pytest.approx(fresh["map_error"]["refined"], rel=1e-4)
+
+
+def test_an_interrupt_ends_all_photos(monkeypatch):
+    seen = see(EXAMPLE, 16, Stages())
+    calls = []
+
+    def improve(photo, prepared, estimate, *_):
+        calls.append(photo)
+        return replace(estimate, interrupted=True)
+
+    monkeypatch.setattr("invrender.pipeline._networks", lambda: (Reconstructor(), improve))
+    maps, result, _ = recover([seen, seen], Stages())
+    assert len(calls) == 1 and result.interrupted
+    np.testing.assert_allclose(result.maps.diffuse, maps.diffuse, atol=0.02)
 
 
 def test_weights_come_back(tmp_path):
