@@ -25,7 +25,7 @@ Array = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]
 # Pixels around the screen's image that may hold some of its light, and how many more for each of
 # the camera's blur: the screen is often a hundred times as bright as the room beside it.
-SCREEN_MARGIN, BLURS = 1.5, 1.5
+SCREEN_MARGIN, MARGIN_BLURS = 1.5, 1.5
 # A veil over the ball is told from the table that is mirrored from 1.8 radii on.
 BARE = 1.8
 VEILED = 0.7  # what it must leave of the residuals' cost to be believed
@@ -201,7 +201,7 @@ def unfold_environment(
     reflectance is divided out. ``blur``: the camera's, in pixels; as far as it spreads the screen's
     light, the room beside it counts as hidden.
     """
-    mask, (rows, columns) = screen_mask(rig, ball, SCREEN_MARGIN + BLURS * blur)
+    mask, (rows, columns) = screen_mask(rig, ball, SCREEN_MARGIN + MARGIN_BLURS * blur)
     origin = (rows.start, columns.start)
     half = height // 2
     wanted = directions(samples * height, 2 * samples * height)[: half * samples].astype(float)
