@@ -10,6 +10,7 @@ import argparse
 import io
 import os
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,7 @@ from invrender.materials import (
     turn_maps,
 )
 from invrender.pattern import default_pattern
+from invrender.pipeline import known_lights
 from invrender.rig import Rig, read_rig
 from invrender.simulate import simulate
 
@@ -140,9 +142,7 @@ def true_lights(folder: Path, capture: Capture) -> Lights:
     room = np.asarray(capture.true_environment, np.float32)
     gain = GAIN if capture.photo.clip_level is None else 1 / float(capture.pattern.max())
     rig, _ = read_rig(folder / "truth" / "rig.toml")
-    shown = capture.pattern * np.float32(gain)
-    seen = np.ones(room.shape[:2], np.float32)
-    return Lights(room, seen, capture.pattern, np.full(3, gain, np.float32), shown, rig)
+    return replace(known_lights(capture, room, gain), rig=rig)
 
 
 def _material(folders: list[Path], k: int, size: int) -> Maps:

@@ -123,14 +123,14 @@ def run(case: Case, seed: int, init: str) -> dict[str, Any]:
     images = [*result.maps.encoded().values(), result.sigma]
     before, after = map_errors(start, case.maps), map_errors(result.maps, case.maps)
     baked = baked_light(result.maps.diffuse, prepared)
-    seen = np.ones(photo.shape[:2], bool) if clipped is None else ~clipped
+    mask = np.zeros(photo.shape[:2], bool) if clipped is None else clipped
     shown = picture(prepared, result.maps, 256)
-    coarse = coarse_error(shown, photo, ~seen)
+    coarse = coarse_error(shown, photo, mask)
     moved = np.abs(to_theta(result.maps) - project(prior.mean.copy())).max(-1)
     return {
         "initial": before,
         "refined": after,
-        "photo_error": photo_error(shown, photo, ~seen),
+        "photo_error": photo_error(shown, photo, mask),
         "coarse_error": coarse,
         "iterations": max(len(result.history) - 1, 1),
         "converged": result.converged,
@@ -138,7 +138,7 @@ def run(case: Case, seed: int, init: str) -> dict[str, Any]:
         "warns": not result.converged or coarse > POOR_FIT[init] or baked > BAKED,
         "finite": bool(all(np.isfinite(i).all() for i in images)),
         "greatest albedo": float((result.maps.diffuse + result.maps.specular).max()),
-        "moved where clipped": float(moved[~seen].max()) if clipped is not None else None,
+        "moved where clipped": float(moved[mask].max()) if clipped is not None else None,
         "seconds": seconds,
     }
 

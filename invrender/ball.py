@@ -73,14 +73,16 @@ def find_ball(photo: Photo, rig: Rig, manual: tuple[float, float, float] | None 
         raise InputError("no mirror ball found: the photo shows nothing where the rig puts it")
     starts.sort(key=lambda pair: -pair[0])
 
+    def finer(theta: Array) -> Array:
+        return _climb(view, rig, _climb(view, rig, theta, 1, 0.04, 40), 0, 0.02, 40)
+
     def places() -> Iterator[Array]:
-        best, *other = (theta for _, theta in starts[:2])
-        best = _climb(view, rig, _climb(view, rig, best, 1, 0.04, 40), 0, 0.02, 40)
+        best = finer(starts[0][1])
         yield best
         # The others serve only where the best one leaves doubt.
         yield best * [1, 1, 0.93]
-        for theta in other:
-            yield _climb(view, rig, _climb(view, rig, theta, 1, 0.04, 40), 0, 0.02, 40)
+        for _, other in starts[1:2]:
+            yield finer(other)
         yield best * [1, 1, 1.07]
 
     balls: list[Ball] = []

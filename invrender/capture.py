@@ -230,9 +230,9 @@ def level(photo: Photo, rig: Rig, ball: Ball) -> Rig:
     screen too. A tilt that the rig tells is kept, and one below `TILTED` not believed; a JPEG's
     rounding hides the horizon too well.
     """
-    if any(rig.camera_tilt) or photo.clip_level is not None:
+    tilt = ball.camera_tilt
+    if tilt is None or any(rig.camera_tilt) or photo.clip_level is not None:
         return rig
-    tilt = ball.camera_tilt or (0.0, 0.0, 0.0)
     if np.linalg.norm(tilt) < TILTED:
         return rig
     return rig.turned(Rotation.from_rotvec(tilt, degrees=True), np.asarray(ball.position))

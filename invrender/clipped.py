@@ -70,15 +70,24 @@ def raise_clipped(
         return environment, 1.0
     assert photo.clip_level is not None
     extra = np.asarray(share * photo.clip_level / np.asarray(rig.ball_reflectance), np.float32)
+    filled = fill_environment(environment, coverage)
+    seen, at, use, known = lit_table(photo, rig, ball, pattern, gain, filled)
+    factor = np.exp(_excess(seen, use, known, room_irradiance(rig, at, extra)))
+    raised = environment + extra * (factor - 1).astype(np.float32)
+    return np.asarray(raised, np.float32), float(factor.mean())
+
+
+def lit_table(
+    photo: Photo, rig: Rig, ball: Ball, pattern: Array, gain: Array, environment: Array
+) -> tuple[Array, Array, Mask, Array]:
+    """The blocks that show the table: log radiance (n, 3), points (n, 3), which those are (h, w),
+    and their irradiance (n, 3) from the screen and the filled environment."""
     seen, points, use = table_blocks(photo, rig, ball)
     at = points[use]
     cells = resize_pattern(pattern, CELLS) * gain
     screen = np.einsum("nij,ijc->nc", rig.screen_cosines(at, CELLS), cells)
-    room = resample_environment(fill_environment(environment, coverage), ROWS)
-    known = screen + room_irradiance(rig, at, room)
-    factor = np.exp(_excess(np.log(seen[use]), use, known, room_irradiance(rig, at, extra)))
-    raised = environment + extra * (factor - 1).astype(np.float32)
-    return np.asarray(raised, np.float32), float(factor.mean())
+    room = room_irradiance(rig, at, resample_environment(environment, ROWS))
+    return np.log(seen[use]), at, use, screen + room
 
 
 def table_blocks(photo: Photo, rig: Rig, ball: Ball) -> tuple[Array, Array, Mask]:
@@ -127,9 +136,10 @@ def _excess(seen: Array, use: Mask, known: Array, extra: Array) -> Array:
 
     ``seen``: log radiance of the used blocks (n, 3); irradiance is known + (factor - 1)·extra.
     """
-    pairs = [pair for pair, _ in distant_pairs(use)]
+    apart = distant_pairs(use)
+    pairs = [pair for pair, _ in apart]
     # Textures are alike over several blocks: so many pairs count as one.
-    weights = [1 / lag for _, lag in distant_pairs(use)]
+    weights = [1 / lag for _, lag in apart]
 
     def steps(log: Array) -> list[Array]:
         return [(log[i] - log[j]) @ AXES for i, j in pairs]

@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from invrender.clipped import AXES, CELLS, ROUGH, ROWS, distant_pairs, table_blocks
-from invrender.environments import directions, resample_environment
+from invrender.clipped import AXES, ROUGH, distant_pairs, lit_table
+from invrender.environments import directions
 from invrender.images import Photo
 from invrender.mirror import Ball
-from invrender.pattern import resize_pattern
 from invrender.rig import Rig
 from invrender.unfold import room_irradiance, screen_coordinates
 
@@ -51,12 +50,8 @@ def add_hidden_lamp(
     s, t, _ = screen_coordinates(rig, np.asarray(ball.position), d)
     row, column = (np.clip(np.nan_to_num(a) * PARTS, 0, PARTS - 1).astype(int) for a in (t, s))
     part = np.where((coverage <= 0) & (d[..., 2] > 0), row * PARTS + column, -1)
-    seen, points, use = table_blocks(photo, rig, ball)
-    at = points[use]
-    cells = resize_pattern(pattern, CELLS) * gain
-    known = np.einsum("nij,ijc->nc", rig.screen_cosines(at, CELLS), cells)
-    known += room_irradiance(rig, at, resample_environment(environment, ROWS))
-    shading = _Shading(np.log(seen[use]), use, known)
+    seen, at, use, known = lit_table(photo, rig, ball, pattern, gain, environment)
+    shading = _Shading(seen, use, known)
     best = None
     for k in range(PARTS**2):
         light = room_irradiance(rig, at, environment * (part == k)[..., None])

@@ -107,7 +107,7 @@ def see(
     found = None
     turned: list[str] = []
     if environment is not None and gain is not None:
-        lights = _known_lights(capture, environment, gain)
+        lights = known_lights(capture, environment, gain)
     else:
         with stage("ball"):
             capture, found, turned = find_upright_ball(capture, ball)
@@ -127,7 +127,7 @@ def _rgb(gain: Any) -> Array:
     return np.broadcast_to(np.asarray(gain, np.float32), 3).copy()
 
 
-def _known_lights(capture: Capture, environment: Array, gain: Any) -> Lights:
+def known_lights(capture: Capture, environment: Array, gain: Any) -> Lights:
     """Lights that a person states: the pattern is taken to be shown as it should be."""
     covered = np.ones(environment.shape[:2], np.float32)
     shown = (capture.pattern * _rgb(gain)).astype(np.float32)

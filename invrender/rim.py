@@ -80,7 +80,7 @@ def fit_rim(view: View, rig: Rig, theta: Array, thorough: bool = True) -> Rim:
         lines = _Lines(view, light, rig, p, count, blur, limit)
         starts = [p * [1, 1, k, 1, 1, 1, 1] for k in scales]
         spread, edge = np.min([lines.spreads(q) for q in starts], axis=0)
-        if not thorough:
+        if len(starts) > LIKELIEST and not thorough:
             costs = [lines.solve(q, spread, edge, None).cost for q in starts]
             starts = [starts[i] for i in np.argsort(costs)[:LIKELIEST]]
         found = [lines.descend(q, turns, spread, edge) for q in starts]

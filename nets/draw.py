@@ -110,14 +110,17 @@ def draw_material(rng: np.random.Generator, options: Options) -> Maps:
     real = _folder_materials(options.materials, options.split)
     n = options.size
 
+    def piece() -> Maps:
+        jitter = 0.0 if options.split == "holdout" else 1.0
+        return augment(real[rng.integers(len(real))], rng, n, n, jitter=jitter)
+
     def one() -> Maps:
         if not real or rng.random() < options.procedural:
             return procedural_material(int(rng.integers(2**62)), n, n)
-        if options.split == "holdout":
-            return augment(real[rng.integers(len(real))], rng, n, n, jitter=0.0)
-        crossed = rng.random() < CROSSED
-        a, b, c = (augment(real[i], rng, n, n) for i in rng.integers(len(real), size=3))
-        return replace(a, normal=b.normal, roughness=c.roughness) if crossed else a
+        maps = piece()
+        if options.split == "train" and rng.random() < CROSSED:
+            maps = replace(maps, normal=piece().normal, roughness=piece().roughness)
+        return maps
 
     for _ in range(20):
         maps = one()

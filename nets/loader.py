@@ -67,8 +67,10 @@ def _cut(
     index = torch.as_tensor(rows, device=photo.device)
 
     def pixels(images: Tensor) -> Tensor:
+        if crop == size:
+            return images
         parts = [x[:, r : r + crop, c : c + crop] for x, (r, c) in zip(images, cuts, strict=True)]
-        return images if crop == size else torch.stack(parts)
+        return torch.stack(parts)
 
     out = {k: pixels(v[index]) if k in PIXELS else v[index] for k, v in captures.items()}
     out = {k: v if k == "maps" else v.float() for k, v in out.items()}
