@@ -19,6 +19,7 @@ from torch import Tensor
 from invrender.errors import InputError
 from invrender.lobes import fit_lobes
 from invrender.maps import Maps
+from invrender.materials import resize, resize_maps
 from invrender.prior import to_theta
 from invrender.refine import linearise
 from invrender.render import Tables, Unbiased
@@ -34,6 +35,7 @@ WEIGHTS = Path(__file__).with_name("weights")
 TILE, OVERLAP = 1024, 64
 PASSES = 3  # of the correction, at most
 SETTLED = 0.04  # mean change of roughness from which on another pass follows
+COARSE = 128  # pixels of the longer side at which the correction was trained
 
 
 @dataclass
@@ -109,15 +111,28 @@ class Corrector:
         """Steps from an estimate towards what explains the photo (H, W, 3), until one changes
         roughness by less than `SETTLED` or there were `PASSES`; ``clipped``: where the photo is
         saturated. Ctrl-C ends it with what was found so far; keep: as for `Reconstructor`.
-        ``progress`` is told the share done."""
+        ``progress`` is told the share done.
+
+        What is shared by many pixels is judged best at the size of the training: at any greater
+        one roughness takes its large shades from a step at `COARSE`, its details from its own."""
+        height, width = photo.shape[:2]
+        low = tuple(max(1, round(n * COARSE / max(height, width))) for n in (height, width))
         try:
             lobes = fit_lobes(photo, prepared, samples)
             for i in range(PASSES):
                 report = partial(_told, progress, i / PASSES, 1 / PASSES)
                 before = estimate.maps.roughness
-                estimate = self._step(
-                    photo, prepared, estimate, lobes, clipped, samples, keep, report
-                )
+                found = self._step(photo, prepared, estimate, lobes, clipped, samples, keep, report)
+                if max(height, width) > COARSE:
+                    few = None if clipped is None else resize(clipped.astype(np.float32), *low) > 0
+                    coarse = self._step(
+                        resize(photo, *low), prepared, _resized(estimate, *low),
+                        resize_maps(lobes, *low), few, samples,
+                    )  # fmt: skip
+                    own = found.maps.roughness
+                    shades = resize(coarse.maps.roughness - resize(own, *low), height, width)
+                    found.maps.roughness = np.clip(own + shades, 0.02, 1)
+                estimate = found
                 if np.abs(estimate.maps.roughness - before).mean() < SETTLED:
                     break
         except KeyboardInterrupt:
@@ -146,6 +161,11 @@ class Corrector:
         kept = keep and _kept(keep, self.notes, photo, *known)
         out = predict_tiles(self.network, photo.shape[:2], cut, progress, kept)
         return estimate_of(out, estimate.unit)
+
+
+def _resized(estimate: Estimate, height: int, width: int) -> Estimate:
+    sigma = {k: resize(v, height, width) for k, v in estimate.sigma.items()}
+    return replace(estimate, maps=resize_maps(estimate.maps, height, width), sigma=sigma)
 
 
 def _told(progress: Callable[[float], None], start: float, length: float, share: float) -> None:

@@ -9,6 +9,7 @@ torch = pytest.importorskip("torch")
 from invrender.cli import EXAMPLE  # noqa: E402
 from invrender.lobes import fit_lobes  # noqa: E402
 from invrender.maps import constant_maps  # noqa: E402
+from invrender.materials import resize, resize_maps  # noqa: E402
 from invrender.pattern import block_pattern  # noqa: E402
 from invrender.pipeline import Stages, recover, refine_capture, see  # noqa: E402
 from invrender.render import material_from_maps, prepare, radiance  # noqa: E402
@@ -151,6 +152,30 @@ def test_passes_go_on_until_roughness_settles(lit, monkeypatch, settled, passes)
     got = corrector(photo, prepared, guess())
     np.testing.assert_allclose(got.maps.roughness, expected.maps.roughness, atol=1e-6)
     assert np.abs(got.maps.roughness - guess().maps.roughness).mean() > 1e-3
+
+
+def test_roughness_at_large_is_that_of_the_training_size(lit, monkeypatch):
+    """Its large shades are those that a step at `COARSE` finds, its details the step's own."""
+    prepared, photo = lit
+    monkeypatch.setattr("nets.infer.PASSES", 1)
+    corrector = Corrector.__new__(Corrector)
+    corrector.network, corrector.notes = restless(), {}
+    own = corrector(photo, prepared, guess()).maps
+    monkeypatch.setattr("nets.infer.COARSE", SIZE // 2)
+    both = corrector(photo, prepared, guess()).maps
+    low = (SIZE // 2, SIZE // 2)
+    lobes = resize_maps(fit_lobes(photo, prepared, 64), *low)
+    start = guess()
+    start = replace(
+        start,
+        maps=resize_maps(start.maps, *low),
+        sigma={k: resize(v, *low) for k, v in start.sigma.items()},
+    )
+    coarse = corrector._step(resize(photo, *low), prepared, start, lobes, None, 64).maps.roughness
+    shades = resize(coarse - resize(own.roughness, *low), SIZE, SIZE)
+    np.testing.assert_allclose(both.roughness, own.roughness + shades, atol=1e-5)
+    assert np.abs(shades).max() > 1e-3
+    np.testing.assert_array_equal(both.diffuse, own.diffuse)
 
 
 def restless():
