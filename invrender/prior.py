@@ -22,7 +22,7 @@ MIN_ROUGHNESS = 0.03
 MAX_SLOPE = 3.0  # 72 degrees
 # By how much errors exceed what the networks expect, in the order of θ, where lights are estimated:
 # benchmarks/refine_calibrate.py, with the weights in the package.
-UNTOLD = np.array([1.95] * 3 + [1.2] * 3 + [1.05] + [1.35] * 2, np.float32)
+UNTOLD = np.array([2.05] * 3 + [1.1] * 3 + [1.1] + [1.35] * 2, np.float32)
 
 
 @dataclass
