@@ -85,7 +85,8 @@ def main() -> None:
     for name, _, s, kind, *_ in rows:
         if kind == "untrained":
             axis.axvline(s, color="grey", ls=":", label=f"{name} (no weights)")
-    axis.set(xscale="log", yscale="log", xlabel=f"seconds for {SIZE}²", ylabel="average RMSE")
+    top = 1.2 * max(e["average"] for *_, errors in points for e in errors.values())
+    axis.set(xscale="log", ylim=(0, top), xlabel=f"seconds for {SIZE}²", ylabel="average RMSE")
     axis.legend(fontsize=7)
     figure.tight_layout()
     figure.savefig(args.out / "inference.png", dpi=120)
