@@ -185,7 +185,7 @@ def recover(
         with stage("refine"):
             for i, s in enumerate(shots):
                 estimates[i] = improve(
-                    s.photo, s.prepared, estimates[i], s.clipped, samples, keep, told("refine")
+                    s.photo, s.prepared, estimates[i], s.clipped, samples, told("refine")
                 )
                 if estimates[i].interrupted:
                     break

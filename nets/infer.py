@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from invrender.errors import InputError
 from invrender.lobes import fit_lobes
-from invrender.maps import Maps
+from invrender.maps import NAMES, Maps
 from invrender.materials import resize, resize_maps
 from invrender.prior import to_theta
 from invrender.refine import linearise
@@ -35,6 +35,7 @@ WEIGHTS = Path(__file__).with_name("weights")
 TILE, OVERLAP = 1024, 64
 PASSES = 3  # of the correction, at most
 SETTLED = 0.04  # mean change of roughness from which on another pass follows
+WHOLE = 256  # pixels of the longer side at which a sample is judged as a whole
 COARSE = 128  # pixels of the longer side at which the correction was trained
 
 
@@ -72,6 +73,9 @@ class Reconstructor:
     ) -> Estimate:
         """Maps of the sample from its photo (H, W, 3), linear radiance, row 0 at +y.
 
+        The maps of a photo larger than `WHOLE` take their large shades and expected errors from it
+        shrunk to that.
+
         pattern (P, P, 3) and gain (RGB): the screen's radiance; environment (H, 2H, 3) radiance in
         the photo's unit, whatever that is; captured: the screen's radiance as the ball shows it.
         Pixels that are not finite count as black. ``progress`` is told the share done. keep: a
@@ -89,7 +93,11 @@ class Reconstructor:
         batch["position"] = positions(*photo.shape[:2])[None]
         kept = keep and _kept(keep, self.notes, photo, *lights.values())
         out = predict(self.network, batch, partial(_told, report, 0.3, 0.7), kept)
-        return estimate_of(out, white_level(lights))
+        found = estimate_of(out, white_level(lights))
+        if max(photo.shape[:2]) > WHOLE:
+            small = resize(photo, *_fitting(photo, WHOLE))
+            found = _joined(found, self(small, rig, pattern, gain, environment, captured))
+        return found
 
 
 class Corrector:
@@ -105,67 +113,85 @@ class Corrector:
         estimate: Estimate,
         clipped: NDArray[np.bool_] | None = None,
         samples: int = 64,
-        keep: Path | None = None,
         progress: Callable[[float], None] = lambda share: None,
     ) -> Estimate:
         """Steps from an estimate towards what explains the photo (H, W, 3), until one changes
         roughness by less than `SETTLED` or there were `PASSES`; ``clipped``: where the photo is
-        saturated. Ctrl-C ends it with what was found so far; keep: as for `Reconstructor`.
-        ``progress`` is told the share done.
+        saturated. Ctrl-C ends it with what was found so far. ``progress`` is told the share done.
 
-        What is shared by many pixels is judged best at the size of the training: at any greater
-        one roughness takes its large shades from a step at `COARSE`, its details from its own."""
-        height, width = photo.shape[:2]
-        low = tuple(max(1, round(n * COARSE / max(height, width))) for n in (height, width))
+        What is shared by many pixels is judged best at the size of the training: beyond that
+        roughness takes its large shades from a step at `COARSE`, and of a photo larger than
+        `WHOLE` only the large shades are corrected."""
+        if max(photo.shape[:2]) > WHOLE:
+            small = self._small(WHOLE, photo, estimate, clipped)
+            return _joined(estimate, self(small[0], prepared, *small[1:], samples, progress))
         try:
             lobes = fit_lobes(photo, prepared, samples)
             for i in range(PASSES):
-                report = partial(_told, progress, i / PASSES, 1 / PASSES)
-                before = estimate.maps.roughness
-                found = self._step(photo, prepared, estimate, lobes, clipped, samples, keep, report)
-                if max(height, width) > COARSE:
-                    few = None if clipped is None else resize(clipped.astype(np.float32), *low) > 0
-                    coarse = self._step(
-                        resize(photo, *low), prepared, _resized(estimate, *low),
-                        resize_maps(lobes, *low), few, samples,
-                    )  # fmt: skip
-                    own = found.maps.roughness
-                    shades = resize(coarse.maps.roughness - resize(own, *low), height, width)
-                    found.maps.roughness = np.clip(own + shades, 0.02, 1)
+                found = self._step(photo, prepared, estimate, lobes, clipped, samples)
+                if max(photo.shape[:2]) > COARSE:
+                    low, start, few = self._small(COARSE, photo, estimate, clipped)
+                    few_lobes = resize_maps(lobes, *low.shape[:2])
+                    coarse = self._step(low, prepared, start, few_lobes, few, samples)
+                    found = _shaded(found, coarse, ["roughness"])
+                change = np.abs(found.maps.roughness - estimate.maps.roughness).mean()
                 estimate = found
-                if np.abs(estimate.maps.roughness - before).mean() < SETTLED:
+                progress((i + 1) / PASSES)
+                if change < SETTLED:
                     break
         except KeyboardInterrupt:
             estimate = replace(estimate, interrupted=True)
         return estimate
 
+    @staticmethod
+    def _small(
+        longest: int, photo: Array, estimate: Estimate, clipped: NDArray[np.bool_] | None
+    ) -> tuple[Array, Estimate, NDArray[np.bool_] | None]:
+        """All of it shrunk until the longer side is ``longest``."""
+        low = _fitting(photo, longest)
+        few = None if clipped is None else resize(clipped.astype(np.float32), *low) > 0
+        return resize(photo, *low), _resized(estimate, *low), few
+
     def _step(
         self, photo: Array, prepared: Tables | Unbiased, estimate: Estimate, lobes: Maps,
-        clipped: NDArray[np.bool_] | None, samples: int, keep: Path | None = None,
-        progress: Callable[[float], None] | None = None,
+        clipped: NDArray[np.bool_] | None, samples: int,
     ) -> Estimate:  # fmt: skip
-        """One pass. The forward model is evaluated for a band of rows at a time."""
+        """One pass."""
+        inputs = linearised(photo, prepared, estimate, lobes, clipped, samples)
+        batch = {k: torch.from_numpy(v)[None] for k, v in inputs.items()}
+        return estimate_of(predict(self.network, batch), estimate.unit)
 
-        @lru_cache(maxsize=1)
-        def band(top: int, stop: int) -> Batch:
-            inputs = linearised(
-                photo, prepared, estimate, lobes, clipped, samples, slice(top, stop)
-            )
-            return {k: torch.from_numpy(v)[None] for k, v in inputs.items()}
 
-        def cut(rows: slice, columns: slice) -> Batch:
-            return {k: v[..., columns] for k, v in band(rows.start, rows.stop).items()}
-
-        known = [*vars(estimate.maps).values(), *estimate.sigma.values(), *vars(lobes).values()]
-        known += [np.array(samples)] + ([] if clipped is None else [clipped])
-        kept = keep and _kept(keep, self.notes, photo, *known)
-        out = predict_tiles(self.network, photo.shape[:2], cut, progress, kept)
-        return estimate_of(out, estimate.unit)
+def _fitting(photo: Array, longest: int) -> tuple[int, int]:
+    """Height and width of the photo (H, W, 3) shrunk until the longer of them is ``longest``."""
+    height, width = photo.shape[:2]
+    scale = longest / max(height, width)
+    return max(1, round(height * scale)), max(1, round(width * scale))
 
 
 def _resized(estimate: Estimate, height: int, width: int) -> Estimate:
     sigma = {k: resize(v, height, width) for k, v in estimate.sigma.items()}
     return replace(estimate, maps=resize_maps(estimate.maps, height, width), sigma=sigma)
+
+
+def _shaded(estimate: Estimate, coarse: Estimate, names: Iterable[str]) -> Estimate:
+    """The estimate, whose maps ``names`` take from a coarser one all that this one can show."""
+    own, maps = resize_maps(estimate.maps, *coarse.maps.shape), dict(vars(estimate.maps))
+    for name in names:
+        shades = getattr(coarse.maps, name) - getattr(own, name)
+        maps[name] = maps[name] + resize(shades, *estimate.maps.shape)
+    normal = maps["normal"] / np.linalg.norm(maps["normal"], axis=-1, keepdims=True)
+    diffuse, specular = np.clip(maps["diffuse"], 0, 1), np.clip(maps["specular"], 0, 1)
+    return replace(
+        estimate, maps=Maps(diffuse, specular, np.clip(maps["roughness"], 0.02, 1), normal)
+    )
+
+
+def _joined(fine: Estimate, whole: Estimate) -> Estimate:
+    """An estimate with the large shades and the expected errors of a coarser one."""
+    sigma = _resized(whole, *fine.maps.shape).sigma
+    shaded = _shaded(fine, whole, NAMES)
+    return replace(shaded, sigma=sigma, interrupted=whole.interrupted)
 
 
 def _told(progress: Callable[[float], None], start: float, length: float, share: float) -> None:
@@ -191,28 +217,26 @@ def linearised(
     lobes: Maps,
     clipped: NDArray[np.bool_] | None,
     samples: int,
-    rows: slice = slice(None),
 ) -> dict[str, Array]:
-    """The correction's inputs (`nets.correction`) for some rows, float32, without a batch axis."""
+    """The correction's inputs (`nets.correction`), float32, without a batch axis."""
     height, width = photo.shape[:2]
-    theta = to_theta(estimate.maps)[rows]
-    top = rows.indices(height)[0]
-    image, jacobian = linearise(prepared, theta, samples, top=top, height=height)
+    theta = to_theta(estimate.maps)
+    image, jacobian = linearise(prepared, theta, samples)
     diagonal = [jacobian[..., range(3), range(k, k + 3)] for k in (0, 3)]
     columns = [jacobian[..., k] for k in (6, 7, 8)]
     unit = max(estimate.unit, 1e-20)
     seen = np.zeros((height, width), bool) if clipped is None else clipped
     images = {
-        "photo": photo[rows] / unit,
+        "photo": photo / unit,
         "image": image / unit,
         "jacobian": np.concatenate([*diagonal, *columns], -1) / unit,
         "theta": theta,
-        "sigma0": np.stack([estimate.sigma[k][rows] for k in MAPS], -1),
-        "clipped": seen[rows, :, None],
-        "lobes": to_theta(lobes)[rows, :, :7],
+        "sigma0": np.stack([estimate.sigma[k] for k in MAPS], -1),
+        "clipped": seen[..., None],
+        "lobes": to_theta(lobes)[..., :7],
     }
     out = {k: np.ascontiguousarray(np.moveaxis(v, -1, 0), np.float32) for k, v in images.items()}
-    return {**out, "position": np.ascontiguousarray(positions(height, width).numpy()[:, rows])}
+    return {**out, "position": positions(height, width).numpy()}
 
 
 def predict(

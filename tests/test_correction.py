@@ -187,49 +187,57 @@ def restless():
     return network
 
 
-def test_an_interrupted_correction_goes_on_where_it_stopped(lit, tmp_path, monkeypatch):
+def test_an_interrupted_correction_keeps_the_passes_done(lit, monkeypatch):
     prepared, photo = lit
-    monkeypatch.setattr("nets.infer.TILE", 8)
-    monkeypatch.setattr("nets.infer.OVERLAP", 2)
     monkeypatch.setattr("nets.infer.SETTLED", 0.0)
-    monkeypatch.setattr("nets.infer.PASSES", 2)
     corrector = Corrector.__new__(Corrector)
-    network, corrector.notes = restless(), {}
-    corrector.network = network
-    whole = corrector(photo, prepared, guess())
-    calls = []
+    network, calls = restless(), []
 
     def stops(batch):
-        if len(calls) == 5:  # tiles; a pass has four
+        if calls:
             raise KeyboardInterrupt
         calls.append(batch)
         return network(batch)
 
-    corrector.network = stops
-    best = corrector(photo, prepared, guess(), keep=tmp_path)
-    assert best.interrupted and not whole.interrupted
     corrector.network = network
+    assert not corrector(photo, prepared, guess()).interrupted
     once = corrector._step(photo, prepared, guess(), fit_lobes(photo, prepared, 64), None, 64)
     corrector.network = stops
+    best = corrector(photo, prepared, guess())
+    assert best.interrupted
     np.testing.assert_allclose(best.maps.diffuse, once.maps.diffuse, atol=1e-6)
-    calls.clear()
-    rest = corrector(photo, prepared, guess(), keep=tmp_path)
-    assert len(calls) == 3 and not rest.interrupted
-    np.testing.assert_allclose(rest.maps.diffuse, whole.maps.diffuse, atol=1e-6)
-    calls.clear()  # other photos have other tiles
-    assert corrector(1.1 * photo, prepared, guess(), keep=tmp_path).interrupted
+
+
+def test_of_a_large_photo_the_large_shades_are_corrected(lit, monkeypatch):
+    """They are those of the photo shrunk, whose doubts count as well; the details stay."""
+    prepared, photo = lit
+    corrector = Corrector.__new__(Corrector)
+    corrector.network = restless()
+    low = (SIZE // 2, SIZE // 2)
+    start = guess()
+    start.maps.diffuse[::2] += 0.01
+    small = Estimate(
+        resize_maps(start.maps, *low), {k: resize(v, *low) for k, v in start.sigma.items()}, 0.7
+    )
+    whole = corrector(resize(photo, *low), prepared, small)
+    monkeypatch.setattr("nets.infer.WHOLE", SIZE // 2)
+    found = corrector(photo, prepared, start)
+    for name in ("diffuse", "specular", "roughness"):
+        got, old, new = (getattr(e.maps, name) for e in (found, start, whole))
+        shades = resize(new - resize(old, *low), SIZE, SIZE)
+        np.testing.assert_allclose(got, np.clip(old + shades, 0, 1), atol=1e-5, err_msg=name)
+        assert np.abs(shades).max() > 1e-3
+    np.testing.assert_allclose(found.sigma["diffuse"], resize(whole.sigma["diffuse"], SIZE, SIZE))
+    np.testing.assert_allclose(np.linalg.norm(found.maps.normal, axis=-1), 1, atol=1e-5)
 
 
 def test_an_interrupted_run_leaves_the_best_and_goes_on(tmp_path, monkeypatch):
     monkeypatch.setattr("nets.infer.TILE", 16)
     monkeypatch.setattr("nets.infer.OVERLAP", 4)
-    forward, calls = Correction.forward, []
+    forward = Correction.forward
 
     def stops(self, batch):
-        if len(calls) == 2:
-            raise KeyboardInterrupt
-        calls.append(batch)
-        return forward(self, batch)
+        raise KeyboardInterrupt
 
     monkeypatch.setattr(Correction, "forward", stops)
     out, parts = tmp_path / "out", tmp_path / ".out.unfinished"
@@ -238,8 +246,7 @@ def test_an_interrupted_run_leaves_the_best_and_goes_on(tmp_path, monkeypatch):
     report = json.loads((out / "report.json").read_text())
     assert "interrupted: these are the best maps so far" in report["warnings"]
     assert report["map_error"]["initial"] == pytest.approx(report["map_error"]["refined"], rel=0.05)
-    assert len(list(parts.glob("*/*.safetensors"))) == 4 + 2  # the first network's tiles, and two
-    calls.clear()
+    assert len(list(parts.glob("*/*.safetensors"))) == 4  # the first network's tiles
     monkeypatch.setattr(Correction, "forward", forward)
     refine_capture(EXAMPLE, out, size=24)
     assert not parts.exists()
@@ -270,22 +277,6 @@ def test_weights_come_back(tmp_path):
     assert type(again) is type(network)
     for k, v in network.state_dict().items():
         torch.testing.assert_close(again.state_dict()[k], v)
-
-
-def test_tiles_are_linearised_where_they_lie(lit, monkeypatch):
-    """A correction in small tiles sees the same inputs as in one."""
-    prepared, photo = lit
-    whole = linearised(photo, prepared, guess(), LOBES, None, 64)
-    part = linearised(photo, prepared, guess(), LOBES, None, 64, slice(4, 9))
-    for k, v in whole.items():
-        np.testing.assert_allclose(part[k], v[:, 4:9], rtol=1e-3, atol=1e-5, err_msg=k)
-    corrector = Corrector.__new__(Corrector)
-    corrector.network = build("correction").eval()
-    before = corrector(photo, prepared, guess())
-    monkeypatch.setattr("nets.infer.TILE", 8)
-    monkeypatch.setattr("nets.infer.OVERLAP", 2)
-    after = corrector(photo, prepared, guess())
-    np.testing.assert_allclose(after.maps.diffuse, before.maps.diffuse, atol=1e-4)
 
 
 def test_lobes_are_followed_where_trusted(lit):
