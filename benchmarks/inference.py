@@ -24,18 +24,21 @@ from invrender.rig import Rig
 from nets.data import Options, write_shard
 from nets.infer import WEIGHTS, Reconstructor
 from nets.model import MAPS
-from nets.store import PRESETS, build, load_weights, save_weights
+from nets.store import PRESETS, build, save_weights
 from nets.train import baseline, validate
 
 SIZE = 256
 
 
-def seconds(weights: Path, repeats: int) -> float:
-    """Median time of a sample's maps, the weights loaded and one sample done."""
-    network = Reconstructor(weights)
+def seconds(network: Reconstructor, repeats: int) -> float:
+    """Median time of a sample's maps, one sample done before."""
     photo = np.random.default_rng(0).uniform(0, 1, (SIZE, SIZE, 3)).astype(np.float32)
     pattern, room = default_pattern(128), procedural_environment(0, 64)
     return timed(lambda: network(photo, Rig(), pattern, np.ones(3), room), repeats)[1]
+
+
+def millions(network: torch.nn.Module) -> float:
+    return sum(x.numel() for x in network.parameters()) / 1e6
 
 
 def main() -> None:
@@ -55,21 +58,19 @@ def main() -> None:
     rows: list[list[Any]] = []
     points = []
     for path in args.weights:
-        network, _ = load_weights(path)
-        errors = {k: validate(network, v, torch.device("cpu")) for k, v in sets.items()}
-        size = sum(x.numel() for x in network.parameters()) / 1e6
-        points.append((path.stem, seconds(path, repeats), errors))
-        for k, error in errors.items():
-            rows.append([path.stem, size, points[-1][1], k, *(error[m] for m in MAPS)])
-            rows[-1].append(error["average"])
+        known = Reconstructor(path)
+        errors = {k: validate(known.network, v, torch.device("cpu")) for k, v in sets.items()}
+        points.append((path.stem, seconds(known, repeats), errors))
+        start = [path.stem, millions(known.network), points[-1][1]]
+        rows += [[*start, k, *(e[m] for m in (*MAPS, "average"))] for k, e in errors.items()]
     for name, config in PRESETS.items():
         if config.correction or name in [path.stem for path in args.weights]:
             continue
-        network, untrained = build(name), args.out / f"untrained_{name}.safetensors"
-        save_weights(untrained, network, {})
-        size = sum(x.numel() for x in network.parameters()) / 1e6
-        rows.append([name, size, seconds(untrained, repeats), "untrained", *[""] * 5])
-        untrained.unlink()
+        fresh, file = build(name), args.out / f"untrained_{name}.safetensors"
+        save_weights(file, fresh, {})
+        time = seconds(Reconstructor(file), repeats)
+        rows.append([name, millions(fresh), time, "untrained", *[""] * 5])
+        file.unlink()
     for k, folder in sets.items():
         guess = baseline(folder, 128)
         rows.append(["a constant guess", "", "", k, *(guess[m] for m in (*MAPS, "average"))])

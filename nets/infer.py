@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -19,7 +19,7 @@ from torch import Tensor
 from invrender.errors import InputError
 from invrender.lobes import fit_lobes
 from invrender.maps import NAMES, Maps
-from invrender.materials import resize, resize_maps
+from invrender.materials import resize, resize_maps, unit_normals
 from invrender.prior import to_theta
 from invrender.refine import linearise
 from invrender.render import Tables, Unbiased
@@ -88,15 +88,17 @@ class Reconstructor:
         report(0.0)
         lights = light_inputs(rig, pattern, gain, environment, captured)
         report(0.3)
-        batch = {k: torch.from_numpy(v)[None] for k, v in lights.items()}
-        batch["photo"] = torch.from_numpy(np.ascontiguousarray(photo.transpose(2, 0, 1)))[None]
-        batch["position"] = positions(*photo.shape[:2])[None]
-        kept = keep and _kept(keep, self.notes, photo, *lights.values())
-        out = predict(self.network, batch, partial(_told, report, 0.3, 0.7), kept)
-        found = estimate_of(out, white_level(lights))
+
+        def maps_of(photo: Array, progress: Callable[[float], None] | None = None) -> Estimate:
+            batch = {k: torch.from_numpy(v)[None] for k, v in lights.items()}
+            batch["photo"] = torch.from_numpy(np.ascontiguousarray(photo.transpose(2, 0, 1)))[None]
+            batch["position"] = positions(*photo.shape[:2])[None]
+            kept = keep and _kept(keep, self.notes, photo, *lights.values())
+            return estimate_of(predict(self.network, batch, progress, kept), white_level(lights))
+
+        found = maps_of(photo, partial(_told, report, 0.3, 0.7))
         if max(photo.shape[:2]) > WHOLE:
-            small = resize(photo, *_fitting(photo, WHOLE))
-            found = _joined(found, self(small, rig, pattern, gain, environment, captured))
+            found = _joined(found, maps_of(resize(photo, *_fitting(photo, WHOLE))))
         return found
 
 
@@ -104,7 +106,7 @@ class Corrector:
     """The learned correction (`nets.correction`) ready for use."""
 
     def __init__(self, weights: Path | None = None) -> None:
-        self.network, self.notes = load_weights(weights or WEIGHTS / "correction.safetensors")
+        self.network, _ = load_weights(weights or WEIGHTS / "correction.safetensors")
 
     def __call__(
         self,
@@ -123,16 +125,16 @@ class Corrector:
         roughness takes its large shades from a step at `COARSE`, and of a photo larger than
         `WHOLE` only the large shades are corrected."""
         if max(photo.shape[:2]) > WHOLE:
-            small = self._small(WHOLE, photo, estimate, clipped)
-            return _joined(estimate, self(small[0], prepared, *small[1:], samples, progress))
+            small, start, few = _shrunk(WHOLE, photo, estimate, clipped)
+            return _joined(estimate, self(small, prepared, start, few, samples, progress))
         try:
             lobes = fit_lobes(photo, prepared, samples)
             for i in range(PASSES):
                 found = self._step(photo, prepared, estimate, lobes, clipped, samples)
                 if max(photo.shape[:2]) > COARSE:
-                    low, start, few = self._small(COARSE, photo, estimate, clipped)
-                    few_lobes = resize_maps(lobes, *low.shape[:2])
-                    coarse = self._step(low, prepared, start, few_lobes, few, samples)
+                    small, start, few = _shrunk(COARSE, photo, estimate, clipped)
+                    own = resize_maps(lobes, *small.shape[:2])
+                    coarse = self._step(small, prepared, start, own, few, samples)
                     found = _shaded(found, coarse, ["roughness"])
                 change = np.abs(found.maps.roughness - estimate.maps.roughness).mean()
                 estimate = found
@@ -142,15 +144,6 @@ class Corrector:
         except KeyboardInterrupt:
             estimate = replace(estimate, interrupted=True)
         return estimate
-
-    @staticmethod
-    def _small(
-        longest: int, photo: Array, estimate: Estimate, clipped: NDArray[np.bool_] | None
-    ) -> tuple[Array, Estimate, NDArray[np.bool_] | None]:
-        """All of it shrunk until the longer side is ``longest``."""
-        low = _fitting(photo, longest)
-        few = None if clipped is None else resize(clipped.astype(np.float32), *low) > 0
-        return resize(photo, *low), _resized(estimate, *low), few
 
     def _step(
         self, photo: Array, prepared: Tables | Unbiased, estimate: Estimate, lobes: Maps,
@@ -169,9 +162,18 @@ def _fitting(photo: Array, longest: int) -> tuple[int, int]:
     return max(1, round(height * scale)), max(1, round(width * scale))
 
 
-def _resized(estimate: Estimate, height: int, width: int) -> Estimate:
-    sigma = {k: resize(v, height, width) for k, v in estimate.sigma.items()}
-    return replace(estimate, maps=resize_maps(estimate.maps, height, width), sigma=sigma)
+def _shrunk(
+    longest: int, photo: Array, estimate: Estimate, clipped: NDArray[np.bool_] | None
+) -> tuple[Array, Estimate, NDArray[np.bool_] | None]:
+    """All of it shrunk until the longer side is ``longest``; what touches a saturated pixel is."""
+    low = _fitting(photo, longest)
+    few = None if clipped is None else resize(clipped.astype(np.float32), *low) > 0
+    maps, sigma = resize_maps(estimate.maps, *low), _resized(estimate.sigma, *low)
+    return resize(photo, *low), replace(estimate, maps=maps, sigma=sigma), few
+
+
+def _resized(sigma: dict[str, Array], height: int, width: int) -> dict[str, Array]:
+    return {k: resize(v, height, width) for k, v in sigma.items()}
 
 
 def _shaded(estimate: Estimate, coarse: Estimate, names: Iterable[str]) -> Estimate:
@@ -180,18 +182,15 @@ def _shaded(estimate: Estimate, coarse: Estimate, names: Iterable[str]) -> Estim
     for name in names:
         shades = getattr(coarse.maps, name) - getattr(own, name)
         maps[name] = maps[name] + resize(shades, *estimate.maps.shape)
-    normal = maps["normal"] / np.linalg.norm(maps["normal"], axis=-1, keepdims=True)
     diffuse, specular = np.clip(maps["diffuse"], 0, 1), np.clip(maps["specular"], 0, 1)
-    return replace(
-        estimate, maps=Maps(diffuse, specular, np.clip(maps["roughness"], 0.02, 1), normal)
-    )
+    roughness, normal = np.clip(maps["roughness"], 0.02, 1), unit_normals(maps["normal"])
+    return replace(estimate, maps=Maps(diffuse, specular, roughness, normal))
 
 
 def _joined(fine: Estimate, whole: Estimate) -> Estimate:
     """An estimate with the large shades and the expected errors of a coarser one."""
-    sigma = _resized(whole, *fine.maps.shape).sigma
-    shaded = _shaded(fine, whole, NAMES)
-    return replace(shaded, sigma=sigma, interrupted=whole.interrupted)
+    sigma = _resized(whole.sigma, *fine.maps.shape)
+    return replace(_shaded(fine, whole, NAMES), sigma=sigma, interrupted=whole.interrupted)
 
 
 def _told(progress: Callable[[float], None], start: float, length: float, share: float) -> None:
@@ -239,33 +238,16 @@ def linearised(
     return {**out, "position": positions(height, width).numpy()}
 
 
+@torch.inference_mode()
 def predict(
     network: torch.nn.Module,
     batch: Batch,
     progress: Callable[[float], None] | None = None,
     keep: Path | None = None,
 ) -> Batch:
-    """A network on a batch of any size, in overlapping tiles where it is large."""
-
-    def cut(rows: slice, columns: slice) -> Batch:
-        return {
-            k: v[..., rows, columns] if k in (*PIXELS, "position") else v for k, v in batch.items()
-        }
-
-    return predict_tiles(network, batch["photo"].shape[-2:], cut, progress, keep)
-
-
-@torch.inference_mode()
-def predict_tiles(
-    network: torch.nn.Module,
-    shape: Sequence[int],
-    cut: Callable[[slice, slice], Batch],
-    progress: Callable[[float], None] | None = None,
-    keep: Path | None = None,
-) -> Batch:
-    """A network's output (B, C, H, W), tile by tile; ``cut`` gives the batch of some rows and
-    columns. Tiles come in bands of rows. Each is kept in the folder ``keep`` or read from there."""
-    height, width = shape
+    """A network's output (B, C, H, W) for a batch of any size, in overlapping tiles where it is
+    large. Each tile is kept in the folder ``keep`` or read from there."""
+    height, width = batch["photo"].shape[-2:]
     tiles = list(_tiles(height, width))
     sums: dict[str, Tensor] = {}
     total = torch.zeros(1, 1, height, width)
@@ -274,7 +256,10 @@ def predict_tiles(
         if path and path.exists():
             out = load_file(path)
         else:
-            out = network(cut(rows, columns))
+            out = network({
+                k: v[..., rows, columns] if k in (*PIXELS, "position") else v
+                for k, v in batch.items()
+            })  # fmt: skip
             if path:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 part = path.with_suffix(".part")

@@ -144,7 +144,7 @@ def test_passes_go_on_until_roughness_settles(lit, monkeypatch, settled, passes)
     monkeypatch.setattr("nets.infer.SETTLED", settled)
     network = restless()
     corrector = Corrector.__new__(Corrector)
-    corrector.network, corrector.notes = network, {}
+    corrector.network = network
     lobes = fit_lobes(photo, prepared, 64)
     expected = guess()
     for _ in range(passes):
@@ -159,7 +159,7 @@ def test_roughness_at_large_is_that_of_the_training_size(lit, monkeypatch):
     prepared, photo = lit
     monkeypatch.setattr("nets.infer.PASSES", 1)
     corrector = Corrector.__new__(Corrector)
-    corrector.network, corrector.notes = restless(), {}
+    corrector.network = restless()
     own = corrector(photo, prepared, guess()).maps
     monkeypatch.setattr("nets.infer.COARSE", SIZE // 2)
     both = corrector(photo, prepared, guess()).maps
@@ -229,6 +229,19 @@ def test_of_a_large_photo_the_large_shades_are_corrected(lit, monkeypatch):
         assert np.abs(shades).max() > 1e-3
     np.testing.assert_allclose(found.sigma["diffuse"], resize(whole.sigma["diffuse"], SIZE, SIZE))
     np.testing.assert_allclose(np.linalg.norm(found.maps.normal, axis=-1), 1, atol=1e-5)
+
+
+def test_no_normal_points_below_the_surface(lit, monkeypatch):
+    """Not even steep details on shades that the correction turned the other way."""
+    prepared, photo = lit
+    corrector = Corrector.__new__(Corrector)
+    corrector.network = restless()
+    start = guess()
+    start.maps.normal[::2] = [0.9999, 0, 0.0141]
+    monkeypatch.setattr("nets.infer.WHOLE", SIZE // 2)
+    normal = corrector(photo, prepared, start).maps.normal
+    assert (normal[..., 2] > 0).all()
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=-1), 1, atol=1e-5)
 
 
 def test_an_interrupted_run_leaves_the_best_and_goes_on(tmp_path, monkeypatch):

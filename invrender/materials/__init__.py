@@ -10,6 +10,7 @@ from invrender.materials.augment import (
     resize_maps,
     rotate_maps,
     turn_maps,
+    unit_normals,
 )
 from invrender.materials.files import (
     find_materials,
@@ -39,4 +40,5 @@ __all__ = [
     "resize_maps",
     "rotate_maps",
     "turn_maps",
+    "unit_normals",
 ]

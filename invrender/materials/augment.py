@@ -46,7 +46,7 @@ def _weights(old: int, new: int) -> csr_array:
     return csr_array((values, column.ravel(), start), shape=(new, old))
 
 
-def _unit(normal: Array) -> Array:
+def unit_normals(normal: Array) -> Array:
     """Unit vectors, none below the surface."""
     normal = normal.copy()
     normal[..., 2] = np.maximum(normal[..., 2], 1e-3)
@@ -61,7 +61,7 @@ def resize_maps(maps: Maps, height: int, width: int) -> Maps:
         resize(maps.diffuse, height, width),
         resize(maps.specular, height, width),
         resize(maps.roughness, height, width),
-        _unit(resize(maps.normal, height, width)),
+        unit_normals(resize(maps.normal, height, width)),
     )
 
 
@@ -110,7 +110,9 @@ def rotate_maps(maps: Maps, angle: float, size: int) -> Maps:
 
     n = sample(maps.normal)
     n = np.stack([c * n[..., 0] - s * n[..., 1], s * n[..., 0] + c * n[..., 1], n[..., 2]], -1)
-    return Maps(sample(maps.diffuse), sample(maps.specular), sample(maps.roughness), _unit(n))
+    return Maps(
+        sample(maps.diffuse), sample(maps.specular), sample(maps.roughness), unit_normals(n)
+    )
 
 
 def jitter_maps(maps: Maps, rng: np.random.Generator, strength: float = 1.0) -> Maps:
@@ -137,7 +139,7 @@ def jitter_maps(maps: Maps, rng: np.random.Generator, strength: float = 1.0) -> 
         np.clip(coloured(maps.diffuse), 0, 0.95).astype(np.float32),
         specular.astype(np.float32),
         np.clip(rough, 0.03, 1).astype(np.float32),
-        _unit(normal),
+        unit_normals(normal),
     )
 
 
@@ -161,7 +163,7 @@ def mix(a: Maps, b: Maps, mask: Array, step: float = 0.0) -> Maps:
         a.diffuse + (b.diffuse - a.diffuse) * t3,
         a.specular + (b.specular - a.specular) * t3,
         a.roughness + (b.roughness - a.roughness) * t,
-        _unit(normal),
+        unit_normals(normal),
     )
 
 
