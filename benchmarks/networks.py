@@ -22,16 +22,17 @@ from nets.model import MAPS
 from nets.train import baseline, parser, train
 
 VARIANTS = {
-    "no clues (LPL+)": ("none", "off", "off", "off"),
-    "mirror ball": ("mirrorball", "off", "off", "off"),
-    "plane clues": ("plane", "off", "off", "off"),
-    "coloured normal clues": ("colored", "off", "off", "off"),
-    "the paper's clues": ("full", "off", "off", "off"),
-    "+ clues of the screen": ("full", "on", "off", "off"),
-    "+ slopes (ours)": ("full", "on", "on", "off"),
-    "ours with denoiser": ("full", "on", "on", "on"),
-}  # clues, active, slopes, denoiser
-FULL, NONE = "+ slopes (ours)", "no clues (LPL+)"
+    "no clues (LPL+)": ("none", "off", "off", "off", "off"),
+    "mirror ball": ("mirrorball", "off", "off", "off", "off"),
+    "plane clues": ("plane", "off", "off", "off", "off"),
+    "coloured normal clues": ("colored", "off", "off", "off", "off"),
+    "the paper's clues": ("full", "off", "off", "off", "off"),
+    "+ clues of the screen": ("full", "on", "off", "off", "off"),
+    "+ slopes": ("full", "on", "on", "off", "off"),
+    "+ lobes (ours)": ("full", "on", "on", "on", "off"),
+    "ours with denoiser": ("full", "on", "on", "on", "on"),
+}  # clues, active, slopes, lobes, denoiser
+FULL, NONE = "+ lobes (ours)", "no clues (LPL+)"
 
 
 def make_data(out: Path) -> None:
@@ -45,11 +46,11 @@ def make_data(out: Path) -> None:
 def train_variant(name: str, args: argparse.Namespace) -> list[dict[str, float]]:
     """Train a variant and return its log."""
     out = args.out / "runs" / name.replace(" ", "-").strip("+-").replace("(", "").replace(")", "")
-    clues, active, slopes, denoiser = VARIANTS[name]
+    clues, active, slopes, lobes, denoiser = VARIANTS[name]
     options = parser().parse_args([
         "--data", str(args.data), "--out", str(out), "--valid", *args.valid,
         "--preset", args.preset, "--clues", clues, "--active", active, "--slopes", slopes,
-        "--denoiser", denoiser, "--steps", str(args.steps), "--every", str(args.every),
+        "--lobes", lobes, "--denoiser", denoiser, "--steps", str(args.steps), "--every", str(args.every),
         "--crop", str(args.crop), "--batch", str(args.batch), "--valid-count", "96",
         "--threads", str(args.threads), "--device", args.device,
     ])  # fmt: skip

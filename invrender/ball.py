@@ -148,10 +148,9 @@ def _alignment(view: View, curve: Array, normal: Array) -> Array:
     The share of the structure tensor across the curve, with the usual trace added below so that
     flat and noisy places count little. Blind to which side is the lighter one.
     """
-    at = np.stack([curve[:, 1] - 0.5, curve[:, 0] - 0.5])
-    xx, xy, yy = (
-        ndimage.map_coordinates(view.tensor[..., k], at, order=1, mode="constant") for k in range(3)
-    )
+    h, w = view.tensor.shape[:2]
+    inside = ((curve >= 0.5) & (curve <= [w - 0.5, h - 0.5])).all(-1)
+    xx, xy, yy = (_look(view.tensor[None], 0, curve) * inside[:, None]).T
     nx, ny = normal[:, 0], normal[:, 1]
     across = xx * nx * nx + 2 * xy * nx * ny + yy * ny * ny
     return np.asarray(across / (xx + yy + 3 * view.noise))
@@ -233,7 +232,7 @@ def _mirrored_table(rig: Rig, theta: Array, normal: Array) -> tuple[Array, Array
     return point, mirrored[..., 2], point - mirrored * (point[..., 2:] / down)
 
 
-def _look(levels: Array, level: Array, at: Array) -> Array:
+def _look(levels: Array, level: Array | int, at: Array) -> Array:
     """Bilinear look-ups (n, 3) in the chosen level at positions (n, 2), the border repeated."""
     h, w = levels.shape[1:3]
     x, y = np.clip(at[:, 0] - 0.5, 0, w - 1.001), np.clip(at[:, 1] - 0.5, 0, h - 1.001)

@@ -46,10 +46,9 @@ def plane_terms(
     scalar = prepared.scene.scalar
     view = make_view(prepared.scene, height, width)
     shading = shade(prepared, view, dr.opaque(scalar, rho), vector(scalar, 3)(0, 0, 1), samples)
-    e, b, a = (
-        np.asarray(x).T.reshape(height, width, 3)
-        for x in (shading.irradiance, shading.b, shading.a)
-    )
+    parts = shading.irradiance, shading.b, shading.a
+    dr.eval(parts)  # one launch for all
+    e, b, a = (np.asarray(x).T.reshape(height, width, 3) for x in parts)
     return e, b, a
 
 

@@ -19,6 +19,7 @@ from scipy.ndimage import uniform_filter
 
 from invrender.initial import USUAL_ROUGHNESS, USUAL_SPECULAR, diffuse_rest, plane_terms
 from invrender.maps import Maps
+from invrender.materials import resize
 from invrender.render import Tables, Unbiased
 
 Array = NDArray[np.floating[Any]]
@@ -30,6 +31,7 @@ UNUSUAL = 3.0  # by how much -2 log-likelihood must fall for another than a lobe
 LEAST_F0 = 0.02  # of common materials
 METAL = 0.2  # f0 from which a material may be bare metal
 FIT_SIZE = 128  # pixels a side of the fit: what decides is as wide as the pattern's features
+SMOOTH, GRID = 0.15, 64  # from this ρ on, E, B and A are interpolated from so many pixels a side
 MEASUREMENTS = 100.0  # that a photo's worth of pixels counts for: texture repeats
 MATERIALS, ROUNDS = 4, 4
 
@@ -59,7 +61,7 @@ def fit_lobes(photo: Array, prepared: Tables | Unbiased, samples: int = 64) -> M
     h, w = min(FIT_SIZE, height), min(FIT_SIZE, width)
     rows, columns = _centres(h, height), _centres(w, width)
     small = photo[np.ix_(rows, columns)]
-    terms = [plane_terms(prepared, h, w, float(rho), samples) for rho in ROUGHNESS]
+    terms = [_terms(prepared, h, w, float(rho), samples) for rho in ROUGHNESS]
 
     rho = int(np.abs(ROUGHNESS - USUAL_ROUGHNESS).argmin())
     usual = Lobe(rho, np.full(3, USUAL_SPECULAR), np.ones(3))
@@ -76,9 +78,10 @@ def fit_lobes(photo: Array, prepared: Tables | Unbiased, samples: int = 64) -> M
 
     # At full size each pixel chooses among the lobes anew.
     full = {
-        rho: plane_terms(prepared, height, width, float(ROUGHNESS[rho]), samples)
+        rho: terms[rho] if (h, w) == (height, width)
+        else _terms(prepared, height, width, float(ROUGHNESS[rho]), samples)
         for rho in {f.rho for f in lobes}
-    }
+    }  # fmt: skip
     label = _closest(photo, [full[f.rho] for f in lobes], lobes)
     normal = np.zeros((height, width, 3), np.float32)
     normal[..., 2] = 1
@@ -88,6 +91,14 @@ def fit_lobes(photo: Array, prepared: Tables | Unbiased, samples: int = 64) -> M
         ROUGHNESS[[f.rho for f in lobes]].astype(np.float32)[label],
         normal,
     )
+
+
+def _terms(
+    prepared: Tables | Unbiased, height: int, width: int, rho: float, samples: int
+) -> list[Array]:
+    """`plane_terms`, for wide lobes from a coarse grid."""
+    h, w = (height, width) if rho < SMOOTH else (min(GRID, height), min(GRID, width))
+    return [resize(x, height, width) for x in plane_terms(prepared, h, w, rho, samples)]
 
 
 def _centres(n: int, of: int) -> Labels:
@@ -137,20 +148,13 @@ def _moments(photo: Array, terms: list[Any]) -> Array:
 def _fit(moments: Array, of: NDArray[np.bool_], usual: Lobe) -> Lobe:
     """The lobe of the pixels ``of``: as usual, of another f0, or bare metal."""
     measurements = MEASUREMENTS * float(of.mean())
-    mean = moments @ (of.ravel() / of.sum())
-    n = len(ROUGHNESS)
-    residual, f0, albedo = np.zeros((3, n)), np.zeros((3, n, 3)), np.zeros((3, n, 3))
-    for i in range(n):
-        for c in range(3):
-            variance = _least_squares(mean[i, c], 0.0, 0.0)[2]
-            pulls = [variance / measurements / s**2 for s in SPREAD_F0]
-            fits = [_least_squares(mean[i, c], pull, float(usual.f0[c])) for pull in pulls]
-            metal = mean[i, c] * [0, 0, 1, 0, 1, 1]
-            fits.append(_least_squares(metal, 0.0, 0.0))
-            for k in range(3):
-                f0[k, i, c], albedo[k, i, c] = fits[k][:2]
-                residual[k, i] += fits[k][2] / 3
-    cost = measurements * np.log(residual + 1e-9)
+    mean = np.moveaxis(moments @ (of.ravel() / of.sum()), -1, 0)  # (6, ρ, 3)
+    variance = _least_squares(mean, 0.0, usual.f0)[2]
+    metal = mean * np.array([0, 0, 1, 0, 1, 1])[:, None, None]
+    fits = [_least_squares(mean, variance / measurements / s**2, usual.f0) for s in SPREAD_F0]
+    fits.append(_least_squares(metal, 0.0, usual.f0))
+    f0, albedo, residual = (np.stack(x) for x in zip(*fits, strict=True))
+    cost = measurements * np.log(residual.mean(-1) + 1e-9)
     cost += ((ROUGHNESS - ROUGHNESS[usual.rho]) / SPREAD) ** 2
     cost[1:] += UNUSUAL
     cost[2, f0[2].mean(-1) < METAL] = np.inf
@@ -164,16 +168,17 @@ def _weight(photo: Array, pixels: Array) -> Array:
     return 1 / np.sqrt(level * (pixels + 0.1 * level))
 
 
-def _least_squares(moments: Array, pull: float, usual: float) -> tuple[float, float, float]:
+def _least_squares(moments: Array, pull: Any, usual: Array) -> tuple[Array, Array, Array]:
     """k_s from `LEAST_F0` and k_d in [0, 1] of z ≈ k_d·x + k_s·y, and the mean squared residual.
 
-    moments: the means of xx, xy, yy, xz, yz and zz. pull: weight of (k_s - usual)².
+    moments: the means of xx, xy, yy, xz, yz and zz. pull: weight of (k_s - usual)². Any shapes that
+    broadcast.
     """
-    xx, xy, yy, xz, yz, zz = (float(v) for v in moments)
+    xx, xy, yy, xz, yz, zz = moments
     x2, y2, y1 = xx + 1e-20, yy + pull + 1e-20, yz + pull * usual
-    k_d = np.clip((y2 * xz - xy * y1) / max(x2 * y2 - xy * xy, 1e-30), 0, 1)
-    k_s = float(np.clip((y1 - xy * k_d) / y2, LEAST_F0, 1))
-    k_d = float(np.clip((xz - xy * k_s) / x2, 0, 1))
+    k_d = np.clip((y2 * xz - xy * y1) / np.maximum(x2 * y2 - xy * xy, 1e-30), 0, 1)
+    k_s = np.clip((y1 - xy * k_d) / y2, LEAST_F0, 1)
+    k_d = np.clip((xz - xy * k_s) / x2, 0, 1)
     rest = zz - 2 * k_d * xz - 2 * k_s * yz
     rest += k_d * k_d * xx + 2 * k_d * k_s * xy + k_s * k_s * yy
-    return k_s, k_d, max(rest, 0.0)
+    return k_s, k_d, np.maximum(rest, 0.0)

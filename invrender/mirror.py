@@ -49,10 +49,13 @@ def mirror_normals(rig: Rig, position: Array, radius: float, target: Array, near
         point = position + radius * normal
         to_camera = rig.camera - point
         to_target = target - point if near else target
-        half = to_camera / np.linalg.norm(to_camera, axis=-1, keepdims=True)
-        half = half + to_target / np.linalg.norm(to_target, axis=-1, keepdims=True)
-        normal = half / np.linalg.norm(half, axis=-1, keepdims=True)
+        normal = _unit(_unit(to_camera) + _unit(to_target))
     return normal
+
+
+def _unit(v: Array) -> Array:
+    """Vectors (..., 3) made unit ones; several times as fast as `numpy.linalg.norm` allows."""
+    return np.asarray(v / np.sqrt(np.einsum("...i,...i->...", v, v))[..., None])
 
 
 def outline_points(rig: Rig, position: Array, radius: float, count: int = 128) -> Array:

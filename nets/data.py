@@ -35,7 +35,7 @@ from invrender.render import Tables, Unbiased, material_from_maps, prepare, radi
 from invrender.scene import make_scene, make_view
 from nets.clues import light_inputs, white_level
 from nets.draw import Options, draw_environment, draw_material, draw_rigs, light_pattern
-from nets.infer import estimate_of, linearised, predict
+from nets.infer import estimate_of, linearised, lobe_input, predict
 from nets.loader import positions
 from nets.noise import (
     capture_pattern,
@@ -77,7 +77,7 @@ def make_group(rng: np.random.Generator, options: Options) -> list[Sample]:
     # Light adds up: the room beside a dark screen, and the screen alone as it is and should be.
     room = prepare(make_scene(true, np.ones_like(pattern), env, gain=0.0))
     screens = [prepare(make_scene(true, p, None, g)) for p, g in ((shown, 1.0), (pattern, gain))]
-    known_lights = None
+    known_lights = prepare(make_scene(known, pattern, seen, gain))
     out = []
     for _ in range(options.per_room):
         maps = draw_material(rng, options)
@@ -86,20 +86,22 @@ def make_group(rng: np.random.Generator, options: Options) -> list[Sample]:
         parts = [radiance(p, view, material, options.samples) for p in (room, *screens)]
         dr.eval(parts)
         a, b, c = (np.asarray(p).T.reshape(size, size, 3) for p in parts)
-        sample = {"photo": sensor(rng, a + b), "ideal": a + c, **lights}
+        photo = sensor(rng, a + b)
+        sample = {"photo": photo, "ideal": a + c, **lights}
         if all(np.isfinite(v).all() for v in sample.values()):
             packed = _pack(sample, unit, maps)
             if problems(packed):
                 continue
+            lobes = fit_lobes(photo, known_lights, options.samples)
+            packed["lobes"] = lobe_input(lobes).astype(np.float16)
             if options.network:
-                known_lights = known_lights or prepare(make_scene(known, pattern, seen, gain))
-                packed = _for_correction(packed, unit, known_lights, options)
+                packed = _for_correction(packed, unit, known_lights, lobes, options)
             out.append(packed)
     return out
 
 
 def _for_correction(
-    sample: Sample, unit: float, prepared: Tables | Unbiased, options: Options
+    sample: Sample, unit: float, prepared: Tables | Unbiased, lobes: Maps, options: Options
 ) -> Sample:
     """What a network makes of a capture, as the correction sees it."""
     batch = {
@@ -109,7 +111,6 @@ def _for_correction(
     found = estimate_of(predict(network_cached(options.network), batch), unit)
     photo = np.moveaxis(sample["photo"].astype(np.float32), 0, -1) * unit
     clipped = (photo >= 0.999 * photo.max()).any(-1)
-    lobes = fit_lobes(photo, prepared, options.samples)
     seen = linearised(photo, prepared, found, lobes, clipped, options.samples)
     out = {k: np.clip(v, -6e4, 6e4).astype(np.float16) for k, v in seen.items() if k != "position"}
     return {**out, "maps": sample["maps"]}

@@ -22,8 +22,9 @@ from invrender.maps import NAMES, Maps
 from invrender.materials import resize, resize_maps, unit_normals
 from invrender.prior import to_theta
 from invrender.refine import linearise
-from invrender.render import Tables, Unbiased
+from invrender.render import Tables, Unbiased, prepare
 from invrender.rig import Rig
+from invrender.scene import make_scene
 from nets.clues import light_inputs, white_level
 from nets.loader import PIXELS, positions
 from nets.model import MAPS, Batch
@@ -44,13 +45,15 @@ class Estimate:
     """Maps, and for each the standard deviation (H, W) that the network expects of its error.
 
     Those of normals are of the encoded map, n/2 + 1/2; where the photo says nothing they are large.
-    unit: the radiance of a white plane under the capture's lights. interrupted: by Ctrl-C, before
-    all passes of the correction were done.
+    unit: the radiance of a white plane under the capture's lights. lobes: what
+    `invrender.lobes` found of the photo, at most `WHOLE` pixels a side, if the network asked for it.
+    interrupted: by Ctrl-C, before all passes of the correction were done.
     """
 
     maps: Maps
     sigma: dict[str, Array]
     unit: float
+    lobes: Maps | None = None
     interrupted: bool = False
 
 
@@ -87,14 +90,24 @@ class Reconstructor:
         report = progress or (lambda _: None)
         report(0.0)
         lights = light_inputs(rig, pattern, gain, environment, captured)
+        unit = white_level(lights)
+        scale = 1 / max(unit, 1e-20)
+        scene = make_scene(rig, pattern, environment, np.asarray(gain) * scale, scale)
+        prepared = prepare(scene)
         report(0.3)
 
         def maps_of(photo: Array, progress: Callable[[float], None] | None = None) -> Estimate:
             batch = {k: torch.from_numpy(v)[None] for k, v in lights.items()}
             batch["photo"] = torch.from_numpy(np.ascontiguousarray(photo.transpose(2, 0, 1)))[None]
             batch["position"] = positions(*photo.shape[:2])[None]
+            lobes = None
+            if self.network.config.lobes:
+                seen = np.clip(np.nan_to_num(photo * scale, posinf=0.0, neginf=0.0), 0, 1e3)
+                lobes = fit_lobes(seen, prepared)
+                batch["lobes"] = torch.from_numpy(lobe_input(lobes))[None]
             kept = keep and _kept(keep, self.notes, photo, *lights.values())
-            return estimate_of(predict(self.network, batch, progress, kept), white_level(lights))
+            out = predict(self.network, batch, progress, kept)
+            return replace(estimate_of(out, unit), lobes=lobes)
 
         found = maps_of(photo, partial(_told, report, 0.3, 0.7))
         if max(photo.shape[:2]) > WHOLE:
@@ -128,7 +141,7 @@ class Corrector:
             small, start, few = _shrunk(WHOLE, photo, estimate, clipped)
             return _joined(estimate, self(small, prepared, start, few, samples, progress))
         try:
-            lobes = fit_lobes(photo, prepared, samples)
+            lobes = estimate.lobes or fit_lobes(photo, prepared, samples)
             for i in range(PASSES):
                 found = self._step(photo, prepared, estimate, lobes, clipped, samples)
                 if max(photo.shape[:2]) > COARSE:
@@ -189,8 +202,8 @@ def _shaded(estimate: Estimate, coarse: Estimate, names: Iterable[str]) -> Estim
 
 def _joined(fine: Estimate, whole: Estimate) -> Estimate:
     """An estimate with the large shades and the expected errors of a coarser one."""
-    sigma = _resized(whole.sigma, *fine.maps.shape)
-    return replace(_shaded(fine, whole, NAMES), sigma=sigma, interrupted=whole.interrupted)
+    shaded, sigma = _shaded(fine, whole, NAMES), _resized(whole.sigma, *fine.maps.shape)
+    return replace(shaded, sigma=sigma, lobes=whole.lobes, interrupted=whole.interrupted)
 
 
 def _told(progress: Callable[[float], None], start: float, length: float, share: float) -> None:
@@ -232,10 +245,14 @@ def linearised(
         "theta": theta,
         "sigma0": np.stack([estimate.sigma[k] for k in MAPS], -1),
         "clipped": seen[..., None],
-        "lobes": to_theta(lobes)[..., :7],
     }
     out = {k: np.ascontiguousarray(np.moveaxis(v, -1, 0), np.float32) for k, v in images.items()}
-    return {**out, "position": positions(height, width).numpy()}
+    return {**out, "lobes": lobe_input(lobes), "position": positions(height, width).numpy()}
+
+
+def lobe_input(lobes: Maps) -> Array:
+    """Albedos and roughness of a fit (`invrender.lobes`) as the networks see them, (7, H, W)."""
+    return np.ascontiguousarray(np.moveaxis(to_theta(lobes)[..., :7], -1, 0))
 
 
 @torch.inference_mode()

@@ -5,7 +5,8 @@ pass) → clue encoder; both bottlenecks → fusion → material decoder. A batc
 
     photo (B, 3, H, W) radiance; position (B, 2, H, W) in [-1, 1]², x right, y up; and the light as
     `nets.clues.light_inputs` gives it, each with a batch axis: env_clues, active_clues,
-    slope_clues, sky, screen, ball, pattern, rig.
+    slope_clues, sky, screen, ball, pattern, rig; and with ``lobes`` lobes (B, 7, H, W), albedos and
+    roughness as `invrender.lobes` finds them.
 
 All of it may be in any unit of radiance: it is divided by that of a white plane first.
 """
@@ -47,6 +48,7 @@ class Config:
 
     active: clues of the screen's light too, and the ratio of the photo to a white plane.
     slopes: how radiance depends on the slopes, and what that says of them (`nets.slopes`).
+    lobes: what all pixels of a material, fitted together, say of it (`invrender.lobes`).
     clue_skips: the material decoder also gets the clue encoder's skips. narrow_fusion: halve the
     channels before the fusion blocks, not after. correction: not this network but the correction
     of its maps (`nets.correction`), which heeds sizes alone.
@@ -59,6 +61,7 @@ class Config:
     clues: str = "full"
     active: bool = True
     slopes: bool = True
+    lobes: bool = True
     clue_skips: bool = True
     narrow_fusion: bool = True
     denoiser: bool = False
@@ -165,6 +168,8 @@ class Network(nn.Module):
             inputs.append(
                 slope_features(photo, active + plane, sample(batch["slope_clues"], position))
             )
+        if self.config.lobes:
+            inputs.append(2 * pad_to(batch["lobes"], self.multiple) - 0.5)
 
         x, skips = self.encoder(_last(torch.cat(inputs, 1)))
         slope0 = self.normal_decoder(x, skips)
@@ -216,6 +221,7 @@ def _knows_environment(config: Config) -> bool:
 def _channels(config: Config) -> tuple[int, int]:
     """Input channels of the image encoder and of the clue encoder."""
     image = 8 + (12 if config.active else 0) + (SLOPE_FEATURES if config.slopes else 0)
+    image += 7 if config.lobes else 0
     lit = 6 if config.active else 0
     clue = {
         "none": 0, "mirrorball": 3, "plane": 12, "full": 16 + lit, "colored": 24 + lit,

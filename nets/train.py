@@ -134,6 +134,16 @@ class Trainer:
         return _Averaged(self)
 
 
+def take_up(network: nn.Module, known: nn.Module) -> None:
+    """Give a network the weights of another one, which may lack its last inputs: these begin at
+    nought."""
+    state, own = known.state_dict(), network.state_dict()
+    for k, v in state.items():
+        if v.ndim == 4 and v.shape[1] < own[k].shape[1]:
+            state[k] = nn.functional.pad(v, (0, 0, 0, 0, 0, own[k].shape[1] - v.shape[1]))
+    network.load_state_dict(state)
+
+
 class _Averaged:
     def __init__(self, trainer: Trainer) -> None:
         self.trainer = trainer
@@ -212,13 +222,13 @@ def train(args: argparse.Namespace) -> Trainer:
         torch.set_num_threads(args.threads)
     torch.manual_seed(args.seed)
     changes: dict[str, Any] = {"clues": args.clues} if args.clues else {}
-    for name in ("active", "slopes", "denoiser"):
+    for name in ("active", "slopes", "lobes", "denoiser"):
         if (value := getattr(args, name)) is not None:
             changes[name] = value == "on"
     args.out.mkdir(parents=True, exist_ok=True)
     trainer = Trainer(build(args.preset, **changes), args.out, device, args.decay)
     if args.weights:
-        trainer.network.load_state_dict(load_weights(args.weights)[0].state_dict())
+        take_up(trainer.network, load_weights(args.weights)[0])
         trainer.mean = {k: v.detach().clone() for k, v in trainer.network.state_dict().items()}
     resumed = trainer.resume()
     valid = dict(v.split("=", 1) for v in args.valid)
@@ -317,8 +327,9 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--clues", choices=CLUES)
     p.add_argument("--active", choices=("on", "off"))
     p.add_argument("--slopes", choices=("on", "off"))
+    p.add_argument("--lobes", choices=("on", "off"))
     p.add_argument("--denoiser", choices=("on", "off"))
-    p.add_argument("--weights", type=Path, help="start from these")
+    p.add_argument("--weights", type=Path, help="start from these, which may lack the last inputs")
     p.add_argument("--steps", type=int, default=50000)
     p.add_argument("--batch", type=int, default=8)
     p.add_argument("--crop", type=int, default=96)

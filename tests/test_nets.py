@@ -17,6 +17,7 @@ from nets.infer import Reconstructor, _tiles, predict  # noqa: E402
 from nets.loader import positions  # noqa: E402
 from nets.model import CLUES, normalise  # noqa: E402
 from nets.store import build, load_weights, save_weights  # noqa: E402
+from nets.train import take_up  # noqa: E402
 
 RIG = Rig()
 torch.set_num_threads(1)  # small tensors: more only get in each other's way
@@ -34,6 +35,7 @@ def make_batch(lights, height, width, count=1, seed=0):
     photo = rng.random((count, 3, height, width), np.float32) * 0.3
     batch["photo"] = torch.from_numpy(photo)
     batch["position"] = positions(height, width)[None].repeat(count, 1, 1, 1)
+    batch["lobes"] = torch.from_numpy(rng.random((count, 7, height, width), np.float32))
     return batch
 
 
@@ -278,8 +280,8 @@ def test_exposure_does_not_matter(lights):
     """All radiance in another unit: the same maps."""
     network = shaken(build("tiny"))
     a = make_batch(lights, 8, 8)
-    b = {k: v if k in ("position", "rig") else v * 1e3 for k, v in a.items()}
-    c = {k: v if k in ("position", "rig") else v * 1e-4 for k, v in a.items()}
+    b = {k: v if k in ("position", "rig", "lobes") else v * 1e3 for k, v in a.items()}
+    c = {k: v if k in ("position", "rig", "lobes") else v * 1e-4 for k, v in a.items()}
     expected = network(a)
     for other in (network(b), network(c)):
         for k, v in expected.items():
@@ -324,6 +326,15 @@ def test_weights_come_back(lights, tmp_path):
     torch.testing.assert_close(half(batch)["diffuse"], network(batch)["diffuse"], atol=0.01, rtol=0)
 
 
+def test_a_network_grows_by_inputs_that_begin_at_nought(lights):
+    known, grown = shaken(build("tiny", lobes=False)), shaken(build("tiny"), seed=1)
+    take_up(grown, known)
+    batch = make_batch(lights, 8, 8)
+    torch.testing.assert_close(grown(batch)["sigma"], known(batch)["sigma"])
+    weight = grown.encoder.intro.weight
+    assert not weight[:, -7:].any() and weight[:, :-7].all()
+
+
 @pytest.mark.parametrize("content", [b"", b"nothing of the kind", None])
 def test_bad_weights_are_refused(tmp_path, content):
     path = tmp_path / "w.safetensors"
@@ -356,6 +367,20 @@ def test_inference_at_any_size(reconstructor, shape):
     for v in (result.maps.diffuse, result.maps.specular, result.maps.roughness):
         assert v.min() >= 0 and v.max() <= 1
     assert steps[0] == 0 and steps[-1] == 1 and steps == sorted(steps)
+
+
+def test_lobes_are_those_of_the_photo_in_any_unit(reconstructor):
+    """What the network is told of the lobes is the fit, which the correction takes over."""
+    env = scale_environment(procedural_environment(5, 32), 0.5)
+    maps = constant_maps(24, 24, diffuse=0.3, roughness=0.3, specular=0.04)
+    photo = radiance_of(make_scene(RIG, block_pattern(64), env, 1.0), maps)
+    found = reconstructor(photo, RIG, block_pattern(64), 1.0, env).lobes
+    assert np.abs(found.diffuse - 0.3).mean() < 0.03
+    assert np.abs(found.roughness - 0.3).mean() < 0.1
+    for k in (1e-9, 1e9):
+        again = reconstructor(photo * k, RIG, block_pattern(64), k, env * k).lobes
+        np.testing.assert_allclose(again.roughness, found.roughness)
+        np.testing.assert_allclose(again.diffuse, found.diffuse, atol=1e-3)
 
 
 def test_inference_without_a_room_or_with_a_bad_photo(reconstructor):
