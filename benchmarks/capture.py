@@ -40,6 +40,8 @@ SURE = 0.9  # confidence from which a wrong ball counts
 HEADER = [
     "photo",
     "kind",
+    "sample told",
+    "sample",
     "centre",
     "radius",
     "irradiance",
@@ -52,12 +54,19 @@ HEADER = [
 
 
 def measure(shot: Shot, kind: str) -> dict[str, Any]:
-    """One photo's errors: of the ball in radii, of irradiance and gain relative, of the pose."""
+    """One photo's errors: of the sample's corners, as told and as found, in its sides; of the ball
+    in radii; of irradiance and gain relative; of the screen's pose."""
     row: dict[str, Any] = {"photo": shot.name, "kind": kind}
     capture = Capture(shot.photo, shot.nominal, shot.pattern)
     start = time.process_time()
     try:
-        ball = find_ball(shot.photo, shot.nominal)
+        capture, tilt = posed(capture)
+        true = corners(shot.photo, shot.rig)
+        side = np.linalg.norm(true[1] - true[0])
+        for name, rig in (("sample told", shot.nominal), ("sample", capture.rig)):
+            off = np.linalg.norm(corners(shot.photo, rig) - true, axis=-1)
+            row[name] = float(off.mean() / side)
+        ball = find_ball(capture.photo, capture.rig, tilt=tilt)
         row["s"] = time.process_time() - start
         row["confidence"] = ball.confidence
         if shot.ball is not None:
@@ -80,10 +89,10 @@ def measure(shot: Shot, kind: str) -> dict[str, Any]:
         )
         row[name] = float(np.abs(e - t).mean() / t.mean())
     # Where a gamma is fitted the pattern's mean tells the light, whatever the curve.
-    light, true = (
+    light, shown = (
         (p * g).mean((0, 1)) for p, g in ((lights.pattern, lights.gain), (shot.shown, shot.gain))
     )
-    row["gain"] = float(np.abs(light / true - 1).mean())
+    row["gain"] = float(np.abs(light / shown - 1).mean())
     found = screen_pose(lights.rig, np.asarray(ball.position))
     assert shot.ball is not None
     centre, turn = screen_pose(shot.rig, shot.ball)
@@ -109,7 +118,7 @@ def big_photo() -> float:
     shot = make_shot(SEED - 1, width=4000)
     start = time.process_time()
     with contextlib.suppress(InputError):
-        find_ball(shot.photo, shot.nominal)
+        find_upright_ball(Capture(shot.photo, shot.nominal, shot.pattern))
     return time.process_time() - start
 
 
@@ -146,6 +155,9 @@ def main() -> None:
     more = {
         "balls refused": sum("refused" in r for r in rows),
         "accepted without a ball": sum("refused" not in r for r in wrong),
+        "sample's corners as told, share of a side, median": median("sample told"),
+        "sample's corners, share of a side, median": median("sample"),
+        "sample's corners within 1%": float(np.mean([r["sample"] <= 0.01 for r in rows])),
     }
     write_results(args.out, {"bars": bars, **more, "photos": rows, "without a ball": wrong})
     table = markdown(HEADER, [[r.get(k, "refused") for k in HEADER] for r in rows])

@@ -23,7 +23,7 @@ from invrender.errors import InputError
 from invrender.images import Photo
 from invrender.mirror import Ball, is_whole, make_ball, mirror_normals, on_table, place_ball
 from invrender.rig import Rig
-from invrender.rim import fit_rim
+from invrender.rim import TILT_PRIOR, fit_rim
 
 __all__ = ["Ball", "find_ball", "make_ball", "mirror_normals", "place_ball"]
 
@@ -41,12 +41,18 @@ DOUBT = 0.4
 FINE = 64  # pixels; the ball's radius in the view of the last fit
 
 
-def find_ball(photo: Photo, rig: Rig, manual: tuple[float, float, float] | None = None) -> Ball:
+def find_ball(
+    photo: Photo,
+    rig: Rig,
+    manual: tuple[float, float, float] | None = None,
+    tilt: float = TILT_PRIOR,
+) -> Ball:
     """Find the mirror hemisphere in a photo; the rig says how big it is and about where.
 
     Every place within `SEARCH` radii of the photo's middle is scored by how well the image's edges
     run along the horizon's and the outline's curves there; the best few are refined and the winner
-    kept. ``manual`` (x, y, r) in pixels overrides the search. Raises `InputError` where no ball is
+    kept. ``manual`` (x, y, r) in pixels overrides the search. ``tilt``: how sure the camera's is, a
+    deviation in degrees. Raises `InputError` where no ball is
     found with a confidence of `MIN_CONFIDENCE`, or where it is cut off, saturated or too small.
     """
     size = (photo.height, photo.width)
@@ -87,7 +93,7 @@ def find_ball(photo: Photo, rig: Rig, manual: tuple[float, float, float] | None 
 
     balls: list[Ball] = []
     for theta in places():
-        found = _settle(photo, view, rig, theta, thorough=bool(balls))
+        found = _settle(photo, view, rig, theta, bool(balls), tilt)
         alike = any(_distance(found, other) < ALIKE for other in balls)
         balls.append(found)
         if found.confidence > (LIKELY if alike else SURE):
@@ -105,7 +111,9 @@ def find_ball(photo: Photo, rig: Rig, manual: tuple[float, float, float] | None 
     return ball
 
 
-def _settle(photo: Photo, view: View, rig: Rig, theta: Array, thorough: bool) -> Ball:
+def _settle(
+    photo: Photo, view: View, rig: Rig, theta: Array, thorough: bool, tilt: float
+) -> Ball:
     """The ball near ``theta`` by its rim, with the confidence in it.
 
     The ball is the one that the untilted camera would see like that.
@@ -113,7 +121,7 @@ def _settle(photo: Photo, view: View, rig: Rig, theta: Array, thorough: bool) ->
     size = (photo.height, photo.width)
     found = make_ball(rig, np.array([theta[0], theta[1], 0.0]), theta[2], size)
     fine = view_around(photo, np.asarray(found.centre), 3.3 * found.radius, found.radius / FINE)
-    rim = fit_rim(fine, rig, theta, thorough)
+    rim = fit_rim(fine, rig, theta, thorough, tilt)
     doubt = DOUBT / (1 + (UNSURE / max(rim.deviation, 1e-9)) ** 2)
     confidence = _confidence(view, rim.rig, rim.theta) * (1 - doubt)
     ball = make_ball(rim.rig, np.array([*rim.theta[:2], 0.0]), rim.theta[2], size)

@@ -109,6 +109,8 @@ def summary(capture: Capture, ball: Ball, lights: Lights) -> dict[str, Any]:
         "ball_ellipse": list(ball.ellipse),
         "ball_confidence": ball.confidence,
         "gain": [float(g) for g in lights.gain],
+        "camera_shift": list(lights.rig.camera_shift),
+        "camera_tilt": list(lights.rig.camera_tilt),
         "screen_shift": list(lights.rig.screen_shift),
         "screen_tilt": list(lights.rig.screen_tilt),
         "fit": lights.fit,

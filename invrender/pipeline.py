@@ -29,7 +29,7 @@ from invrender.materials import resize_maps, turn_maps
 from invrender.mirror import Ball
 from invrender.report import Report
 from invrender.results import write_results
-from invrender.upright import find_upright_ball
+from invrender.upright import find_upright_ball, posed
 
 if TYPE_CHECKING:  # Dr.Jit compiles where the refinement is imported
     from invrender.refine import Refined
@@ -107,6 +107,8 @@ def see(
     found = None
     turned: list[str] = []
     if environment is not None and gain is not None:
+        with stage("crop"):
+            capture, _ = posed(capture)
         lights = known_lights(capture, environment, gain)
     else:
         with stage("ball"):

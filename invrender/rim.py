@@ -45,6 +45,7 @@ LUMA = (0.2126, 0.7152, 0.0722)  # a JPEG has its colours at half the resolution
 # of its blur in the view's pixels and of the mirror's reflectance over the rig's.
 _TILT, _BLUR, _MIRROR = slice(3, 5), 5, 6
 TILT_PRIOR, BLUR_PRIOR, MIRROR_PRIOR = 1.5, 0.15, 0.01
+SQUARE_TILT = 0.3  # deviation of a tilt that the sample's square tells (`invrender.square`)
 USUAL_BLUR = 0.8
 OUT = 4.0  # spreads
 ROBUST = 1.25  # spreads from which a residual counts less
@@ -66,18 +67,21 @@ class Rim:
     deviation: float
 
 
-def fit_rim(view: View, rig: Rig, theta: Array, thorough: bool = True) -> Rim:
+def fit_rim(
+    view: View, rig: Rig, theta: Array, thorough: bool = True, tilt: float = TILT_PRIOR
+) -> Rim:
     """The ball near ``theta``: x, y, radius in metres, some hundredths of the radius off.
 
     ``view``: the photo out to about three radii, the ball some 60 pixels in radius. Levenberg's and
     Marquardt's steps, coarse to fine, with Cauchy's weights on the lines' residuals and on the
     distances from the horizon to the strongest edges near it. ``thorough``: from all of a stage's
-    starts, not only from those that fit best as they are.
+    starts, not only from those that fit best as they are. ``tilt``: deviation of the camera's from
+    what the rig tells, degrees.
     """
     p = np.array([*theta, 0.0, 0.0, math.log(USUAL_BLUR), 0.0])
     light = _mend(view.image @ np.array(LUMA))
     for count, blur, limit, turns, scales in STAGES:
-        lines = _Lines(view, light, rig, p, count, blur, limit)
+        lines = _Lines(view, light, rig, p, count, blur, limit, tilt)
         starts = [p * [1, 1, k, 1, 1, 1, 1] for k in scales]
         spread, edge = np.min([lines.spreads(q) for q in starts], axis=0)
         if len(starts) > LIKELIEST and not thorough:
@@ -140,8 +144,9 @@ class _Lines:
     """The lines of one stage, from ``NEAREST`` radii to where the table is known."""
 
     def __init__(
-        self, view: View, light: Array, rig: Rig, p: Array, count: int, blur: float, limit: float
-    ) -> None:
+        self, view: View, light: Array, rig: Rig, p: Array, count: int, blur: float, limit: float,
+        tilt: float,
+    ) -> None:  # fmt: skip
         self.view, self.rig, self.blur, self.limit = view, rig, blur, limit
         self.light = ndimage.gaussian_filter(light, blur) if blur else light
         self.farther = ndimage.gaussian_filter(light, blur + 1)
@@ -160,7 +165,7 @@ class _Lines:
         self.units = np.diag([*np.full(3, p[2] * 2e-3), 0.1, 0.1, 0.05, 0.01])
         aim = 0.1 * rig.camera[2] * math.radians(1)
         self.units[3, 1], self.units[4, 0] = aim, -aim
-        deviation = [TILT_PRIOR, TILT_PRIOR, BLUR_PRIOR, MIRROR_PRIOR]
+        deviation = [tilt, tilt, BLUR_PRIOR, MIRROR_PRIOR]
         self.prior = np.array([*np.full(3, 1e-9), *(1 / np.square(deviation))])
         self.usual = np.array([0, 0, 0, 0, 0, math.log(USUAL_BLUR), 0])
 

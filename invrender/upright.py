@@ -22,6 +22,8 @@ from invrender.images import Photo
 from invrender.mirror import Ball, place_ball
 from invrender.pattern import resize_pattern
 from invrender.rig import Rig
+from invrender.rim import SQUARE_TILT, TILT_PRIOR
+from invrender.square import find_camera
 from invrender.unfold import unfold_pattern
 
 Array = NDArray[np.floating[Any]]
@@ -47,9 +49,10 @@ def find_upright_ball(
     photo = capture.photo
     # As it is; then with the field of view taken to be across the photo's other side.
     for first in (0, 1) if manual is None and photo.height != photo.width else (0,):
-        here = replace(capture, photo=_turned_photo(photo, first))
+        told = replace(capture, photo=_turned_photo(photo, first))
+        here, tilt = posed(told)
         try:
-            ball = find_ball(here.photo, here.rig, manual)
+            ball = find_ball(here.photo, here.rig, manual, tilt)
         except InputError as error:
             problem = problem or error
             continue
@@ -58,14 +61,15 @@ def find_upright_ball(
         )
         if usual > 1 - BETTER:  # no orientation can be so much more alike
             return here, ball, _told(first, 0, False)
-        (turn, quarter, mirrored), alike = _orientation(here, ball)
+        (turn, quarter, mirrored), alike = _orientation(told, ball)
         if alike > ALIKE and alike > usual + BETTER:
-            turned, moved = _turned(here, ball, turn)
+            turned, moved = _turned(told, ball, turn)
             assert moved is not None
-            rig = _turned_rig(here.rig, ball.size, turn)
+            rig = _turned_rig(capture.rig, ball.size, turn)
             shown = oriented(here.pattern, quarter, mirrored)
-            here = replace(here, photo=turned, rig=rig, pattern=shown)
-            ball = replace(moved, confidence=ball.confidence)
+            here, _ = posed(replace(told, photo=turned, rig=rig, pattern=shown))
+            again = place_ball(here.rig, moved.size, *moved.centre, moved.radius)
+            ball = replace(again, confidence=ball.confidence, camera_tilt=moved.camera_tilt)
             return here, ball, _told((first + turn) % 4, quarter, mirrored)
         if first == 0:
             fallback = here, ball, usual
@@ -76,6 +80,13 @@ def find_upright_ball(
     if manual is None and usual < UNLIKE and capture.pattern.std((0, 1)).max() > FLAT:
         raise not_the_pattern(ball)
     return here, ball, []
+
+
+def posed(capture: Capture) -> tuple[Capture, float]:
+    """The capture with its camera where the sample's square is seen from, if that is plain; and the
+    deviation to expect of the camera's tilt in degrees."""
+    rig = find_camera(capture.photo, capture.rig)
+    return replace(capture, rig=rig), TILT_PRIOR if rig is capture.rig else SQUARE_TILT
 
 
 def _orientation(capture: Capture, ball: Ball) -> tuple[tuple[int, int, bool], float]:

@@ -41,7 +41,7 @@ def off(found: rim.Rim, rig, shift=(0.0, 0.0)) -> float:
 def test_rays_in_the_planes_are_those_in_space(shift):
     p = unknowns(TILTED, shift)
     view = view_of(np.ones((*SIZE, 3), np.float32), TILTED, shift)
-    lines = rim._Lines(view, view.image[..., 0], TILTED, p, 16, 0.0, 1.25)
+    lines = rim._Lines(view, view.image[..., 0], TILTED, p, 16, 0.0, 1.25, rim.TILT_PRIOR)
     got = lines.trace(p)
     centre = np.array([p[0], p[1], 0])
     middle = view.at(centre, TILTED)

@@ -1,0 +1,206 @@
+"""The camera's pose from the sample's square in the photo.
+
+A hand holds the camera a few millimetres and degrees off, and the square of the sample is then not
+where the rig says. Its four sides are straight lines along which the photo changes; textures
+change here and there. So for each side and each line near it, the signed change across is averaged
+over pieces of the line, which texture does not survive, and the pieces' squares, relative to what
+is usual, are summed (as a Hough transform does, of gradients). The pose that explains the four best
+lines together, under a Gaussian prior, is taken: eight numbers for six unknowns, and what disagrees
+is told by what is left.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from invrender.ball_view import View, view_around
+from invrender.images import Photo
+from invrender.rig import Rig
+from invrender.unfold import sample_image
+
+Array = NDArray[np.floating[Any]]
+PIECES, POINTS = 8, 16  # of a side, and along each
+INSET = 0.03  # of a side, what is left out at its ends
+SHIFT, TILT = 2.5e-3, 1.5  # deviations of the camera's place in metres, and of its tilt in degrees
+BLUR = 1.7  # pixels, of changes
+BEST = 5  # lines a side that are combined
+# Pixels of a side, how far off lines are looked for in sides, steps, how far askew in sides; and in
+# pixels the spacing of the places tried, and the deviations of a line's place and slope.
+PASSES = ((256, 0.15, 1, 0.06, 1.0, 1.0, 1.5), (512, 0.02, 2, 0.015, 0.5, 0.4, 0.6))
+MISFIT, UNLIKELY = 40.0, 20.0  # squared deviations: of the lines, two are left; of the pose, six
+# Of three sides, the changes on the line must exceed by so much what they are beside it: where the
+# rig tells it, its median; elsewhere its greatest tenth, and half of the points change most there.
+TOLD, FOUND, MOST = 12.0, 2.0, 0.5
+MOVED = 0.004  # of a side, from which a found pose is believed rather than the told one
+_CORNERS = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) / 2
+
+
+def find_camera(photo: Photo, rig: Rig) -> Rig:
+    """The rig with its camera where the photo's square of the sample says.
+
+    As told where that is where the square is plain, or where it is plain nowhere near.
+    """
+    pose, misfit = np.zeros(6), 0.0
+    if _plain(_view(photo, rig, *PASSES[-1][:2]), rig, told=True):
+        return rig
+    for pixels, reach, turns, askew, step, *deviations in PASSES:
+        view = _view(photo, _posed(rig, pose), pixels, reach)
+        for _ in range(turns):
+            if not _inside(view, _ends(view, _posed(rig, pose))):
+                return rig
+            pose, misfit = _improve(view, rig, pose, reach, askew, step, np.tile(deviations, 4))
+    if misfit > MISFIT or pose @ pose > UNLIKELY or not _plain(view, _posed(rig, pose), told=False):
+        return rig
+    at = [corners(photo, r) for r in (rig, _posed(rig, pose))]
+    length = np.linalg.norm(at[0][1] - at[0][0])
+    if np.linalg.norm(at[1] - at[0], axis=-1).mean() < MOVED * length:
+        return rig
+    return _posed(rig, pose)
+
+
+def corners(photo: Photo, rig: Rig) -> Array:
+    """The sample's corners in photo pixels, (4, 2), one after another around it."""
+    return rig.project(_CORNERS * rig.sample_size, photo.height, photo.width)
+
+
+def _posed(rig: Rig, pose: Array) -> Rig:
+    """The rig with its camera moved: shift and tilt in deviations of the prior."""
+    return replace(
+        rig,
+        camera_shift=tuple(np.add(rig.camera_shift, pose[:3] * SHIFT)),
+        camera_tilt=tuple(np.add(rig.camera_tilt, pose[3:] * TILT)),
+    )
+
+
+def _view(photo: Photo, rig: Rig, pixels: float, reach: float) -> View:
+    """The photo around the square, a side of it about so many pixels."""
+    at = corners(photo, rig)
+    side = float(np.linalg.norm(at[1] - at[0]))
+    half = np.abs(at - at.mean(0)).max() + 1.5 * reach * side
+    return view_around(photo, at.mean(0), half, side / pixels)
+
+
+def _ends(view: View, rig: Rig) -> Array:
+    """The ends of the square's sides in the view, (side, end, 2)."""
+    at = view.at(_CORNERS * rig.sample_size, rig)
+    return np.stack([at, np.roll(at, -1, 0)], 1)
+
+
+def _inside(view: View, ends: Array) -> bool:
+    shape = view.tone.shape[1::-1]
+    return bool(np.isfinite(ends).all() and (ends > 0).all() and (ends < shape).all())
+
+
+def _improve(
+    view: View, rig: Rig, pose: Array, reach: float, askew: float, step: float, deviation: Array
+) -> tuple[Array, float]:
+    """A better pose, and the squared misfit of its lines."""
+    now = _ends(view, _posed(rig, pose))
+    normal = _normals(now)
+
+    def lines(pose: Array) -> Array:
+        """Place and slope of each side, (8,): how far its ends have moved across, the mean and the
+        difference."""
+        off = ((_ends(view, _posed(rig, pose)) - now) * normal[:, None]).sum(-1)
+        return np.stack([off.mean(1), off[:, 1] - off[:, 0]], -1).ravel()
+
+    length = float(np.linalg.norm(now[:, 1] - now[:, 0], axis=-1).mean())
+    best = [_best_lines(view, e, reach * length, askew * length, step) for e in now]
+    units = 0.05 * np.eye(6)
+    slopes = np.stack([(lines(pose + u) - lines(pose - u)) / 0.1 for u in units], -1)
+    weight = 1 / deviation**2
+    solver = np.linalg.inv(slopes.T @ (weight[:, None] * slopes) + np.eye(6))
+    wanted = np.array([np.ravel([b[:2] for b in four]) for four in product(*best)])
+    gain = np.array([sum(b[2] for b in four) for four in product(*best)])
+    moves = (wanted @ (weight[:, None] * slopes) - pose) @ solver
+    misfit = ((wanted - moves @ slopes.T) ** 2) @ weight
+    i = np.argmin(misfit / 2 + ((pose + moves) ** 2).sum(-1) / 2 - gain)
+    return pose + moves[i], float(misfit[i])
+
+
+def _normals(ends: Array) -> Array:
+    """Outward unit normals (..., 2) of sides (..., 2, 2)."""
+    along = ends[..., 1, :] - ends[..., 0, :]
+    length = np.linalg.norm(along, axis=-1, keepdims=True)
+    return np.stack([along[..., 1], -along[..., 0]], -1) / length
+
+
+def _changes(view: View, ends: Array, t: Array) -> tuple[Array, Array]:
+    """How the tone changes across a side (2, 2) at distances t (n,) from it: (3, n, points); and
+    where on the side the points are, from 0 to 1."""
+    u = (np.arange(PIECES * POINTS) + 0.5) / (PIECES * POINTS) * (1 - 2 * INSET) + INSET
+    at = (ends[0] + (ends[1] - ends[0]) * u[:, None]) + t[:, None, None] * _normals(ends)
+    across = np.ascontiguousarray(np.moveaxis(sample_image(view.tone, at), -1, 0))
+    return ndimage.gaussian_filter1d(across, BLUR / (t[1] - t[0]), axis=1, order=1), u
+
+
+def _even(change: Array) -> Array:
+    """Changes such that no single one outweighs the others, in [-1, 1]."""
+    return change / np.sqrt(change**2 + (4 * np.median(np.abs(change)) + 1e-6) ** 2)
+
+
+def _power(change: Array) -> Array:
+    """Squares (..., pieces) of the means of changes (3, ..., points) over pieces of the line."""
+    pieces = change.reshape(*change.shape[:-1], PIECES, POINTS) @ np.full(POINTS, 1 / POINTS)
+    return np.asarray((pieces**2).sum(0))
+
+
+def _plain(view: View, rig: Rig, told: bool) -> bool:
+    """Whether three of the square's sides are lines that textures do not make."""
+    ends = _ends(view, rig)
+    if not _inside(view, ends):
+        return False
+    t = np.arange(-30, 31) * 0.5
+    near, beside = np.abs(t) <= 1, np.abs(t) >= 4
+    plain = 0
+    for side in ends:
+        change, _ = _changes(view, side, t)
+        power = _power(_even(change))
+        usual = np.quantile(power[beside], 0.5 if told else 0.9, axis=0) + 1e-4
+        exceeds = np.median(power[near].max(0) / usual)
+        if told:
+            plain += exceeds > TOLD
+        else:
+            most = t[np.argmax((change**2).sum(0), 0)]
+            plain += exceeds > FOUND and np.mean(np.abs(most) <= 1.5) > MOST
+    return plain >= 3
+
+
+def _best_lines(
+    view: View, ends: Array, reach: float, askew: float, step: float
+) -> list[Array]:
+    """The `BEST` lines near a side (2, 2): place, slope, and how much plainer than usual.
+
+    Place and slope in pixels outwards.
+    """
+    n, m = round(reach / step), round(askew / step)
+    places, slopes = np.arange(-n, n + 1) * step, np.arange(-m, m + 1) * step
+    far = n + round(askew / step / 2) + 1
+    change, u = _changes(view, ends, np.arange(-far, far + 1) * step)
+    change = _even(change)
+    first = np.round(slopes[:, None] * (u - 0.5) / step).astype(int) + far - n
+    row = first[:, None] + np.arange(2 * n + 1)[:, None]  # (slope, place, point)
+    power = _power(change[:, row, np.arange(len(u))])
+    power /= np.median(power, (0, 1)) + 1e-4
+    plain = np.log1p(power / 3).sum(-1)
+    peaks = np.argwhere(plain == ndimage.maximum_filter(plain, 9))
+    peaks = peaks[np.argsort(-plain[tuple(peaks.T)])][:BEST]
+    return [
+        np.array([places[j] + step * _top(plain[i], j), slopes[i] + step * _top(plain[:, j], i),
+                  plain[i, j]])
+        for i, j in peaks
+    ]  # fmt: skip
+
+
+def _top(values: Array, i: int) -> float:
+    """How far beside its greatest value, at ``i``, a parabola through three has its top."""
+    if not 0 < i < len(values) - 1:
+        return 0.0
+    a, b, c = values[i - 1 : i + 2]
+    return float(0.5 * (a - c) / min(a - 2 * b + c, -1e-9))
