@@ -33,7 +33,9 @@ from invrender.environments import resample_environment
 from invrender.errors import InputError
 from invrender.mirror import make_ball
 from invrender.rig import Rig
+from invrender.square import corners
 from invrender.unfold import room_irradiance
+from invrender.upright import find_upright_ball, posed
 
 SEED = 1000  # photos from here on serve for nothing else
 SURE = 0.9  # confidence from which a wrong ball counts

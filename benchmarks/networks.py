@@ -50,7 +50,8 @@ def train_variant(name: str, args: argparse.Namespace) -> list[dict[str, float]]
     options = parser().parse_args([
         "--data", str(args.data), "--out", str(out), "--valid", *args.valid,
         "--preset", args.preset, "--clues", clues, "--active", active, "--slopes", slopes,
-        "--lobes", lobes, "--denoiser", denoiser, "--steps", str(args.steps), "--every", str(args.every),
+        "--lobes", lobes, "--denoiser", denoiser,
+        "--steps", str(args.steps), "--every", str(args.every),
         "--crop", str(args.crop), "--batch", str(args.batch), "--valid-count", "96",
         "--threads", str(args.threads), "--device", args.device,
     ])  # fmt: skip

@@ -111,9 +111,7 @@ def find_ball(
     return ball
 
 
-def _settle(
-    photo: Photo, view: View, rig: Rig, theta: Array, thorough: bool, tilt: float
-) -> Ball:
+def _settle(photo: Photo, view: View, rig: Rig, theta: Array, thorough: bool, tilt: float) -> Ball:
     """The ball near ``theta`` by its rim, with the confidence in it.
 
     The ball is the one that the untilted camera would see like that.
@@ -157,7 +155,7 @@ def _alignment(view: View, curve: Array, normal: Array) -> Array:
     flat and noisy places count little. Blind to which side is the lighter one.
     """
     h, w = view.tensor.shape[:2]
-    inside = ((curve >= 0.5) & (curve <= [w - 0.5, h - 0.5])).all(-1)
+    inside = np.all((curve >= 0.5) & (curve <= [w - 0.5, h - 0.5]), -1)
     xx, xy, yy = (_look(view.tensor[None], 0, curve) * inside[:, None]).T
     nx, ny = normal[:, 0], normal[:, 1]
     across = xx * nx * nx + 2 * xy * nx * ny + yy * ny * ny

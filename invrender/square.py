@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from invrender.ball_view import View, view_around
+from invrender.errors import InputError
 from invrender.images import Photo
 from invrender.rig import Rig
 from invrender.unfold import sample_image
@@ -27,16 +28,18 @@ from invrender.unfold import sample_image
 Array = NDArray[np.floating[Any]]
 PIECES, POINTS = 8, 16  # of a side, and along each
 INSET = 0.03  # of a side, what is left out at its ends
-SHIFT, TILT = 2.5e-3, 1.5  # deviations of the camera's place in metres, and of its tilt in degrees
+SHIFT, TILT = 0.028, 1.5  # deviations of the camera's place, in sides; and of its tilt in degrees
 BLUR = 1.7  # pixels, of changes
 BEST = 5  # lines a side that are combined
 # Pixels of a side, how far off lines are looked for in sides, steps, how far askew in sides; and in
 # pixels the spacing of the places tried, and the deviations of a line's place and slope.
 PASSES = ((256, 0.15, 1, 0.06, 1.0, 1.0, 1.5), (512, 0.02, 2, 0.015, 0.5, 0.4, 0.6))
 MISFIT, UNLIKELY = 40.0, 20.0  # squared deviations: of the lines, two are left; of the pose, six
-# Of three sides, the changes on the line must exceed by so much what they are beside it: where the
-# rig tells it, its median; elsewhere its greatest tenth, and half of the points change most there.
-TOLD, FOUND, MOST = 12.0, 2.0, 0.5
+# Of three sides, the changes on the line must exceed by so much what they are beside it: the
+# greatest tenth of that, and half of the points change most there; where the rig tells it, the
+# median. Then it is kept, unless the changes found elsewhere are that much larger (a sum of four
+# logarithms): a sample may have lines of its own.
+FOUND, MOST, TOLD, BETTER = 2.0, 0.5, 12.0, 1.8
 MOVED = 0.004  # of a side, from which a found pose is believed rather than the told one
 _CORNERS = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) / 2
 
@@ -44,24 +47,37 @@ _CORNERS = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) / 2
 def find_camera(photo: Photo, rig: Rig) -> Rig:
     """The rig with its camera where the photo's square of the sample says.
 
-    As told where that is where the square is plain, or where it is plain nowhere near.
+    As told where the square is as plain there, or plain nowhere near.
     """
-    pose, misfit = np.zeros(6), 0.0
-    if _plain(_view(photo, rig, *PASSES[-1][:2]), rig, told=True):
+    try:
+        pose = _find(photo, rig)
+    except InputError:  # a camera that no rig may have
         return rig
+    if pose is None:
+        return rig
+    at = [corners(photo, r) for r in (rig, _posed(rig, pose))]
+    moved = np.linalg.norm(at[1] - at[0], axis=-1).mean()
+    return _posed(rig, pose) if moved > MOVED * np.linalg.norm(at[0][1] - at[0][0]) else rig
+
+
+def _find(photo: Photo, rig: Rig) -> Array | None:
+    """The camera's pose, in deviations of the prior; None where it is better taken as told."""
+    pose: Array = np.zeros(6)
+    misfit = 0.0
     for pixels, reach, turns, askew, step, *deviations in PASSES:
         view = _view(photo, _posed(rig, pose), pixels, reach)
         for _ in range(turns):
             if not _inside(view, _ends(view, _posed(rig, pose))):
-                return rig
+                return None
             pose, misfit = _improve(view, rig, pose, reach, askew, step, np.tile(deviations, 4))
-    if misfit > MISFIT or pose @ pose > UNLIKELY or not _plain(view, _posed(rig, pose), told=False):
-        return rig
-    at = [corners(photo, r) for r in (rig, _posed(rig, pose))]
-    length = np.linalg.norm(at[0][1] - at[0][0])
-    if np.linalg.norm(at[1] - at[0], axis=-1).mean() < MOVED * length:
-        return rig
-    return _posed(rig, pose)
+    if misfit > MISFIT or pose @ pose > UNLIKELY:
+        return None
+    found = _sides(view, _posed(rig, pose))
+    if np.sum((found[:, 2] > FOUND) & (found[:, 3] > MOST)) < 3:
+        return None
+    told = _sides(_view(photo, rig, *PASSES[-1][:2]), rig)
+    better = np.log(found[:, 0] / told[:, 0]).sum() > BETTER
+    return pose if better or np.sum(told[:, 1] > TOLD) < 3 else None
 
 
 def corners(photo: Photo, rig: Rig) -> Array:
@@ -73,7 +89,7 @@ def _posed(rig: Rig, pose: Array) -> Rig:
     """The rig with its camera moved: shift and tilt in deviations of the prior."""
     return replace(
         rig,
-        camera_shift=tuple(np.add(rig.camera_shift, pose[:3] * SHIFT)),
+        camera_shift=tuple(np.add(rig.camera_shift, pose[:3] * SHIFT * rig.sample_size)),
         camera_tilt=tuple(np.add(rig.camera_tilt, pose[3:] * TILT)),
     )
 
@@ -151,30 +167,30 @@ def _power(change: Array) -> Array:
     return np.asarray((pieces**2).sum(0))
 
 
-def _plain(view: View, rig: Rig, told: bool) -> bool:
-    """Whether three of the square's sides are lines that textures do not make."""
+def _sides(view: View, rig: Rig) -> Array:
+    """Of each side of the square, (4, 4): the changes on it; how many times what is beside they
+    are, its median and its greatest tenth; and the share of its points that change most there.
+
+    Next to nothing where the square is not inside the view.
+    """
     ends = _ends(view, rig)
+    out = np.full((4, 4), 1e-3)
     if not _inside(view, ends):
-        return False
+        return out
     t = np.arange(-30, 31) * 0.5
     near, beside = np.abs(t) <= 1, np.abs(t) >= 4
-    plain = 0
-    for side in ends:
+    for k, side in enumerate(ends):
         change, _ = _changes(view, side, t)
         power = _power(_even(change))
-        usual = np.quantile(power[beside], 0.5 if told else 0.9, axis=0) + 1e-4
-        exceeds = np.median(power[near].max(0) / usual)
-        if told:
-            plain += exceeds > TOLD
-        else:
-            most = t[np.argmax((change**2).sum(0), 0)]
-            plain += exceeds > FOUND and np.mean(np.abs(most) <= 1.5) > MOST
-    return plain >= 3
+        on = power[near].max(0)
+        usual = (np.quantile(power[beside], q, axis=0) + 1e-4 for q in (0.5, 0.9))
+        most = t[np.argmax((change**2).sum(0), 0)]
+        times = [np.median(on / u) for u in usual]
+        out[k] = np.median(on) + 1e-3, *times, np.mean(np.abs(most) <= 1.5)
+    return out
 
 
-def _best_lines(
-    view: View, ends: Array, reach: float, askew: float, step: float
-) -> list[Array]:
+def _best_lines(view: View, ends: Array, reach: float, askew: float, step: float) -> list[Array]:
     """The `BEST` lines near a side (2, 2): place, slope, and how much plainer than usual.
 
     Place and slope in pixels outwards.

@@ -45,8 +45,8 @@ class Estimate:
     """Maps, and for each the standard deviation (H, W) that the network expects of its error.
 
     Those of normals are of the encoded map, n/2 + 1/2; where the photo says nothing they are large.
-    unit: the radiance of a white plane under the capture's lights. lobes: what
-    `invrender.lobes` found of the photo, at most `WHOLE` pixels a side, if the network asked for it.
+    unit: the radiance of a white plane under the capture's lights. lobes: what `invrender.lobes`
+    found of the photo, at most `WHOLE` pixels a side, if the network asked for it.
     interrupted: by Ctrl-C, before all passes of the correction were done.
     """
 

@@ -19,7 +19,8 @@ PRESETS = {
     "small": Config(),
     "paper": Config(
         32, (2, 2, 4, 8), 12, (2, 2, 2, 2),
-        active=False, slopes=False, lobes=False, clue_skips=False, narrow_fusion=False, denoiser=True,
+        active=False, slopes=False, lobes=False, clue_skips=False, narrow_fusion=False,
+        denoiser=True,
     ),
     "tiny": Config(8, (1, 1), 1, (1, 1)),  # for tests
     "correction": Config(16, (1, 1, 2), 2, (1, 1, 1), correction=True),

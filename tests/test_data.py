@@ -43,7 +43,10 @@ def test_a_shard_holds_captures_in_units_of_white(folder):
     white = shard["env_clues"][:, 9:].astype(float) + shard["active_clues"][:, 9:]
     np.testing.assert_allclose(white.mean((1, 2, 3)), 0.6, rtol=0.01)
     assert all(np.isfinite(v.astype(float)).all() for v in shard.values())
-    assert shard["lobes"].shape == (6, 7, 16, 16) and 0 <= shard["lobes"].min() <= shard["lobes"].max() <= 1
+    assert (
+        shard["lobes"].shape == (6, 7, 16, 16)
+        and 0 <= shard["lobes"].min() <= shard["lobes"].max() <= 1
+    )
     assert 0.01 < shard["photo"].astype(float).mean() < 1
 
 
