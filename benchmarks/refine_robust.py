@@ -1,12 +1,13 @@
-"""How the maps suffer where display and rig are not as told: colours and curve, shift and tilt.
+"""How the maps suffer where display and rig are not as told: colours and curve, screen, camera.
 
     python benchmarks/refine_robust.py [--quick] --out DIR [--materials DIR --envs DIR]
 
-The same samples in the same rooms are photographed (path-traced, as in `refine_captures`) three
+The same samples in the same rooms are photographed (path-traced, as in `refine_captures`) four
 times: with pattern and rig as told; with each channel of the pattern times 0.8 to 1.25 and an
-exponent of 1/2.2 to 2.2 on it; and with the screen shifted by up to a tenth of the sample's size
-and tilted by up to 10 degrees. Everything is drawn anew for each capture; the refinement is told
-the nominal pattern and rig. Captures are kept in DIR/captures: a rerun only refines.
+exponent of 1/2.2 to 2.2 on it; with the screen shifted by up to a tenth of the sample's size and
+tilted by up to 10 degrees; and with the camera held 2 mm and 1.2 degrees off (standard deviations).
+Everything is drawn anew for each capture; the refinement is told the nominal pattern and rig.
+Captures are kept in DIR/captures: a rerun only refines.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ from invrender.rig import Rig
 FIRST_SEED = 95_000
 GAIN, GAMMA = 1.25, 2.2  # at most, or one over it
 SHIFT, TILT = 0.1, 10.0  # at most, of the sample's size and degrees
-ALLOWED = {"display": 1.1, "pose": 1.15}
+HELD = 2e-3, 1.2  # standard deviations, metres and degrees; at most two and a half of them
+ALLOWED = {"display": 1.1, "pose": 1.15, "camera": 1.15}
 
 
 def make_captures(
@@ -41,9 +43,12 @@ def make_captures(
     shift, tilt = shift * SHIFT * Rig().sample_size, tilt * TILT
     moved = Rig(screen_shift=tuple(shift.tolist()), screen_tilt=tuple(tilt.tolist()))
     quality = int(rng.integers(85, 97)) if k % 2 else None
+    place, turn = (s * np.clip(rng.normal(size=3), -2.5, 2.5) for s in HELD)
+    held = Rig(camera_shift=tuple(place.tolist()), camera_tilt=tuple(turn.tolist()))
     folders = {}
     for name, rig, screen in (
         ("clean", Rig(), pattern), ("display", Rig(), shown), ("pose", moved, pattern),
+        ("camera", held, pattern),
     ):  # fmt: skip
         folder = folders[name] = out / f"{k:03d}-{name}"
         if not folder.exists():

@@ -11,7 +11,7 @@ is told by what is left.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
@@ -29,17 +29,19 @@ Array = NDArray[np.floating[Any]]
 PIECES, POINTS = 8, 16  # of a side, and along each
 INSET = 0.03  # of a side, what is left out at its ends
 SHIFT, TILT = 0.028, 1.5  # deviations of the camera's place, in sides; and of its tilt in degrees
-BLUR = 1.7  # pixels, of changes
+BLUR, WIDE = 1.7, 0.013  # of changes: pixels, sides
+LEAST = 0.3  # of the greatest change near a side's points, what its border has
 BEST = 5  # lines a side that are combined
+DEVIATIONS, SURE = (0.8, 1.2), (0.3, 0.5)  # of places and slopes at last, in pixels
 # Pixels of a side, how far off lines are looked for in sides, steps, how far askew in sides; and in
 # pixels the spacing of the places tried, and the deviations of a line's place and slope.
-PASSES = ((256, 0.15, 1, 0.06, 1.0, 1.0, 1.5), (512, 0.02, 2, 0.015, 0.5, 0.4, 0.6))
-MISFIT, UNLIKELY = 40.0, 20.0  # squared deviations: of the lines, two are left; of the pose, six
-# Of three sides, the changes on the line must exceed by so much what they are beside it: the
-# greatest tenth of that, and half of the points change most there; where the rig tells it, the
-# median. Then it is kept, unless the changes found elsewhere are that much larger (a sum of four
-# logarithms): a sample may have lines of its own.
-FOUND, MOST, TOLD, BETTER = 2.0, 0.5, 12.0, 1.8
+PASSES = ((256, 0.15, 1, 0.06, 1.0, 1.0, 1.5), (512, 0.02, 2, 0.015, 0.5, *DEVIATIONS))
+MISFIT, UNLIKELY = 25.0, 14.0  # squared deviations: of the lines, two are left; of the pose, six
+# Of three sides, the changes on the line must exceed by so much the greatest tenth of those beside
+# it, and half of the points change most there, or the whole side's by more. Where the rig tells it,
+# the median; then it is kept, unless the changes found elsewhere are that much larger (a sum of
+# four logarithms): a sample may have lines of its own.
+FOUND, MOST, WHOLE, TOLD, BETTER = 2.0, 0.5, 10.0, 12.0, 1.8
 MOVED = 0.004  # of a side, from which a found pose is believed rather than the told one
 _CORNERS = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) / 2
 
@@ -62,10 +64,13 @@ def find_camera(photo: Photo, rig: Rig) -> Rig:
 
 def _find(photo: Photo, rig: Rig) -> Array | None:
     """The camera's pose, in deviations of the prior; None where it is better taken as told."""
+    views = [_view(photo, rig, pixels) for pixels, *_ in PASSES]
+    told = _sides(views[-1], rig)
+    if told.plain():
+        return None
     pose: Array = np.zeros(6)
     misfit = 0.0
-    for pixels, reach, turns, askew, step, *deviations in PASSES:
-        view = _view(photo, _posed(rig, pose), pixels, reach)
+    for view, (_, reach, turns, askew, step, *deviations) in zip(views, PASSES, strict=True):
         for _ in range(turns):
             if not _inside(view, _ends(view, _posed(rig, pose))):
                 return None
@@ -73,11 +78,15 @@ def _find(photo: Photo, rig: Rig) -> Array | None:
     if misfit > MISFIT or pose @ pose > UNLIKELY:
         return None
     found = _sides(view, _posed(rig, pose))
-    if np.sum((found[:, 2] > FOUND) & (found[:, 3] > MOST)) < 3:
+    if not found.plain():
         return None
-    told = _sides(_view(photo, rig, *PASSES[-1][:2]), rig)
-    better = np.log(found[:, 0] / told[:, 0]).sum() > BETTER
-    return pose if better or np.sum(told[:, 1] > TOLD) < 3 else None
+    better = np.log(found.on / told.on).sum() > BETTER
+    if not better and np.sum(told.median > TOLD) >= 3:
+        return None
+    for _ in range(2):
+        border = _outermost(view, _ends(view, _posed(rig, pose)))
+        pose = pose + _solve(_slopes(view, rig, pose), pose, *border)
+    return pose
 
 
 def corners(photo: Photo, rig: Rig) -> Array:
@@ -94,11 +103,11 @@ def _posed(rig: Rig, pose: Array) -> Rig:
     )
 
 
-def _view(photo: Photo, rig: Rig, pixels: float, reach: float) -> View:
-    """The photo around the square, a side of it about so many pixels."""
+def _view(photo: Photo, rig: Rig, pixels: float) -> View:
+    """The photo around where the square may be, a side of it about so many pixels."""
     at = corners(photo, rig)
     side = float(np.linalg.norm(at[1] - at[0]))
-    half = np.abs(at - at.mean(0)).max() + 1.5 * reach * side
+    half = np.abs(at - at.mean(0)).max() + 1.5 * PASSES[0][1] * side
     return view_around(photo, at.mean(0), half, side / pixels)
 
 
@@ -118,42 +127,87 @@ def _improve(
 ) -> tuple[Array, float]:
     """A better pose, and the squared misfit of its lines."""
     now = _ends(view, _posed(rig, pose))
+    length = float(np.linalg.norm(now[:, 1] - now[:, 0], axis=-1).mean())
+    best = [_best_lines(view, e, reach * length, askew * length, step) for e in now]
+    wanted = np.array([np.ravel([b[:2] for b in four]) for four in product(*best)])
+    gain = np.array([sum(b[2] for b in four) for four in product(*best)])
+    slopes = _slopes(view, rig, pose)
+    moves = _solve(slopes, pose, wanted, deviation)
+    misfit = (((wanted - moves @ slopes.T) / deviation) ** 2).sum(-1)
+    i = np.argmin(misfit / 2 + ((pose + moves) ** 2).sum(-1) / 2 - gain)
+    return pose + moves[i], float(misfit[i])
+
+
+def _slopes(view: View, rig: Rig, pose: Array) -> Array:
+    """By what a pose moves the sides' places and slopes, (8, 6)."""
+    now = _ends(view, _posed(rig, pose))
     normal = _normals(now)
 
     def lines(pose: Array) -> Array:
-        """Place and slope of each side, (8,): how far its ends have moved across, the mean and the
-        difference."""
+        """How far each side's ends have moved across: the mean and the difference."""
         off = ((_ends(view, _posed(rig, pose)) - now) * normal[:, None]).sum(-1)
         return np.stack([off.mean(1), off[:, 1] - off[:, 0]], -1).ravel()
 
-    length = float(np.linalg.norm(now[:, 1] - now[:, 0], axis=-1).mean())
-    best = [_best_lines(view, e, reach * length, askew * length, step) for e in now]
-    units = 0.05 * np.eye(6)
-    slopes = np.stack([(lines(pose + u) - lines(pose - u)) / 0.1 for u in units], -1)
+    return np.stack([(lines(pose + u) - lines(pose - u)) / 0.1 for u in 0.05 * np.eye(6)], -1)
+
+
+def _solve(slopes: Array, pose: Array, wanted: Array, deviation: Array) -> Array:
+    """The most probable moves (..., 6) of a pose where places and slopes should move by ``wanted``
+    (..., 8)."""
     weight = 1 / deviation**2
-    solver = np.linalg.inv(slopes.T @ (weight[:, None] * slopes) + np.eye(6))
-    wanted = np.array([np.ravel([b[:2] for b in four]) for four in product(*best)])
-    gain = np.array([sum(b[2] for b in four) for four in product(*best)])
-    moves = (wanted @ (weight[:, None] * slopes) - pose) @ solver
-    misfit = ((wanted - moves @ slopes.T) ** 2) @ weight
-    i = np.argmin(misfit / 2 + ((pose + moves) ** 2).sum(-1) / 2 - gain)
-    return pose + moves[i], float(misfit[i])
+    matrix = slopes.T @ (weight[:, None] * slopes) + np.eye(6)
+    return np.asarray((wanted @ (weight[:, None] * slopes) - pose) @ np.linalg.inv(matrix))
+
+
+def _outermost(view: View, ends: Array) -> tuple[Array, Array]:
+    """Where the sides' outermost changes lie, place and slope, and the deviations of these, (8,).
+
+    A sample has lines beside its border, a plain table has none: from outside inwards the first
+    change that is no table's is the border. A side beside a table that changes as much stays.
+    """
+    t = np.arange(-24, 41) * 0.5
+    outside, near = t >= 6, np.flatnonzero(t <= 6)
+    wanted, deviation = np.zeros((4, 2)), np.tile(DEVIATIONS, (4, 1))
+    for k, side in enumerate(ends):
+        change, u = _changes(view, side, t, BLUR)
+        size = np.sqrt((change**2).sum(0))
+        usual = np.median(size[near].max(0))
+        over = size[near] > max(2.5 * np.quantile(size[outside], 0.95), LEAST * usual)
+        some = over.any(0)
+        first = len(near) - 1 - np.argmax(over[::-1], 0)
+        rows = np.maximum(first - np.arange(7)[:, None], 0)  # the peak behind it
+        peak = t[first - np.argmax(np.take_along_axis(size, rows, 0), 0)]
+        a = np.stack([np.ones_like(u), u - 0.5], -1)[some]
+        line = np.array([np.median(peak[some]), 0.0]) if some.any() else np.zeros(2)
+        for _ in range(10):
+            weight = 1 / (1 + (peak[some] - a @ line) ** 2)
+            line = np.linalg.solve(a.T @ (weight[:, None] * a) + 1e-6 * np.eye(2),
+                                   a.T @ (weight * peak[some]))  # fmt: skip
+        if np.sum(np.abs(peak[some] - a @ line) < 1) > MOST * len(u):
+            wanted[k], deviation[k] = line, SURE
+    return wanted.ravel(), deviation.ravel()
 
 
 def _normals(ends: Array) -> Array:
     """Outward unit normals (..., 2) of sides (..., 2, 2)."""
     along = ends[..., 1, :] - ends[..., 0, :]
     length = np.linalg.norm(along, axis=-1, keepdims=True)
-    return np.stack([along[..., 1], -along[..., 0]], -1) / length
+    return np.stack([-along[..., 1], along[..., 0]], -1) / length
 
 
-def _changes(view: View, ends: Array, t: Array) -> tuple[Array, Array]:
+def _changes(view: View, ends: Array, t: Array, blur: float) -> tuple[Array, Array]:
     """How the tone changes across a side (2, 2) at distances t (n,) from it: (3, n, points); and
     where on the side the points are, from 0 to 1."""
     u = (np.arange(PIECES * POINTS) + 0.5) / (PIECES * POINTS) * (1 - 2 * INSET) + INSET
-    at = (ends[0] + (ends[1] - ends[0]) * u[:, None]) + t[:, None, None] * _normals(ends)
+    step = t[1] - t[0]
+    more = round(3 * blur / step)
+    far = np.concatenate(
+        [t[0] - step * np.arange(more, 0, -1), t, t[-1] + step * np.arange(1, more + 1)]
+    )
+    at = (ends[0] + (ends[1] - ends[0]) * u[:, None]) + far[:, None, None] * _normals(ends)
     across = np.ascontiguousarray(np.moveaxis(sample_image(view.tone, at), -1, 0))
-    return ndimage.gaussian_filter1d(across, BLUR / (t[1] - t[0]), axis=1, order=1), u
+    change = ndimage.gaussian_filter1d(across, blur / step, axis=1, order=1)
+    return change[:, more : more + len(t)], u
 
 
 def _even(change: Array) -> Array:
@@ -167,27 +221,55 @@ def _power(change: Array) -> Array:
     return np.asarray((pieces**2).sum(0))
 
 
-def _sides(view: View, rig: Rig) -> Array:
-    """Of each side of the square, (4, 4): the changes on it; how many times what is beside they
-    are, its median and its greatest tenth; and the share of its points that change most there.
+@dataclass(frozen=True)
+class _Sides:
+    """How plain the square's sides are, (4,) each.
 
-    Next to nothing where the square is not inside the view.
+    ``on``: the changes on it; ``median``, ``tenth``: over the median and the greatest tenth of
+    those beside it; ``most``: the share of its points that change most there. ``wide``: as
+    ``tenth``, of changes over a hundredth of the side; ``whole``: the same, of the whole side's
+    mean.
     """
+
+    on: Array
+    median: Array
+    tenth: Array
+    most: Array
+    wide: Array
+    whole: Array
+
+    def plain(self) -> bool:
+        """Whether three are lines that textures do not make."""
+        sharp = (self.tenth > FOUND) & (self.most > MOST)
+        step = (self.wide > FOUND) & (self.whole > WHOLE)
+        return max(sharp.sum(), step.sum()) >= 3
+
+
+def _sides(view: View, rig: Rig) -> _Sides:
+    """Next to nothing where the view does not show all of them."""
     ends = _ends(view, rig)
-    out = np.full((4, 4), 1e-3)
-    if not _inside(view, ends):
-        return out
+    out = np.full((6, 4), 1e-3)
+    if _inside(view, ends):
+        out[:] = np.transpose([_side(view, side) for side in ends])
+    return _Sides(*out)
+
+
+def _side(view: View, side: Array) -> tuple[Any, ...]:
+    """The numbers of `_Sides` for one side (2, 2)."""
     t = np.arange(-30, 31) * 0.5
-    near, beside = np.abs(t) <= 1, np.abs(t) >= 4
-    for k, side in enumerate(ends):
-        change, _ = _changes(view, side, t)
-        power = _power(_even(change))
-        on = power[near].max(0)
-        usual = (np.quantile(power[beside], q, axis=0) + 1e-4 for q in (0.5, 0.9))
-        most = t[np.argmax((change**2).sum(0), 0)]
-        times = [np.median(on / u) for u in usual]
-        out[k] = np.median(on) + 1e-3, *times, np.mean(np.abs(most) <= 1.5)
-    return out
+    change, _ = _changes(view, side, t, BLUR)
+    power = _power(_even(change))
+    on, beside = power[np.abs(t) <= 1].max(0), power[np.abs(t) >= 4]
+    usual = (np.quantile(beside, q, axis=0) + 1e-4 for q in (0.5, 0.9))
+    most = np.abs(t[np.argmax((change**2).sum(0), 0)]) <= 1.5
+    t = np.arange(-60.0, 61)
+    near, far = np.abs(t) <= 3, np.abs(t) >= 20
+    change, _ = _changes(view, side, t, WIDE * float(np.linalg.norm(side[1] - side[0])))
+    power = _power(_even(change))
+    wide = np.median(power[near].max(0) / (np.quantile(power[far], 0.9, axis=0) + 1e-4))
+    mean = (change.mean(-1) ** 2).sum(0)
+    whole = mean[near].max() / (np.quantile(mean[far], 0.9) + 1e-9)
+    return np.median(on) + 1e-3, *(np.median(on / u) for u in usual), most.mean(), wide, whole
 
 
 def _best_lines(view: View, ends: Array, reach: float, askew: float, step: float) -> list[Array]:
@@ -198,13 +280,15 @@ def _best_lines(view: View, ends: Array, reach: float, askew: float, step: float
     n, m = round(reach / step), round(askew / step)
     places, slopes = np.arange(-n, n + 1) * step, np.arange(-m, m + 1) * step
     far = n + round(askew / step / 2) + 1
-    change, u = _changes(view, ends, np.arange(-far, far + 1) * step)
-    change = _even(change)
-    first = np.round(slopes[:, None] * (u - 0.5) / step).astype(int) + far - n
-    row = first[:, None] + np.arange(2 * n + 1)[:, None]  # (slope, place, point)
-    power = _power(change[:, row, np.arange(len(u))])
-    power /= np.median(power, (0, 1)) + 1e-4
-    plain = np.log1p(power / 3).sum(-1)
+    plain = np.zeros((len(slopes), len(places)))
+    length = float(np.linalg.norm(ends[1] - ends[0]))
+    for blur in (BLUR, WIDE * length):
+        change, u = _changes(view, ends, np.arange(-far, far + 1) * step, blur)
+        first = np.round(slopes[:, None] * (u - 0.5) / step).astype(int) + far - n
+        row = first[:, None] + np.arange(2 * n + 1)[:, None]  # (slope, place, point)
+        power = _power(_even(change)[:, row, np.arange(len(u))])
+        power /= np.median(power, (0, 1)) + 1e-4
+        plain += np.log1p(power / 3).sum(-1)
     peaks = np.argwhere(plain == ndimage.maximum_filter(plain, 9))
     peaks = peaks[np.argsort(-plain[tuple(peaks.T)])][:BEST]
     return [
