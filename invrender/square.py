@@ -30,12 +30,12 @@ PIECES, POINTS = 8, 16  # of a side, and along each
 INSET = 0.03  # of a side, what is left out at its ends
 SHIFT, TILT = 0.028, 1.5  # deviations of the camera's place, in sides; and of its tilt in degrees
 BLUR, WIDE = 1.7, 0.013  # of changes: pixels, sides
+BORDER = 0.3, 0.5  # deviations of a border's place and slope, in pixels
 LEAST = 0.3  # of the greatest change near a side's points, what its border has
 BEST = 5  # lines a side that are combined
-DEVIATIONS, SURE = (0.8, 1.2), (0.3, 0.5)  # of places and slopes at last, in pixels
 # Pixels of a side, how far off lines are looked for in sides, steps, how far askew in sides; and in
 # pixels the spacing of the places tried, and the deviations of a line's place and slope.
-PASSES = ((256, 0.15, 1, 0.06, 1.0, 1.0, 1.5), (512, 0.02, 2, 0.015, 0.5, *DEVIATIONS))
+PASSES = ((256, 0.15, 1, 0.06, 1.0, 1.0, 1.5), (512, 0.02, 2, 0.015, 0.5, 0.8, 1.2))
 MISFIT, UNLIKELY = 25.0, 14.0  # squared deviations: of the lines, two are left; of the pose, six
 # Of three sides, the changes on the line must exceed by so much the greatest tenth of those beside
 # it, and half of the points change most there, or the whole side's by more. Where the rig tells it,
@@ -66,7 +66,7 @@ def _find(photo: Photo, rig: Rig) -> Array | None:
     """The camera's pose, in deviations of the prior; None where it is better taken as told."""
     views = [_view(photo, rig, pixels) for pixels, *_ in PASSES]
     told = _sides(views[-1], rig)
-    if told.plain():
+    if told.sharp().all():
         return None
     pose: Array = np.zeros(6)
     misfit = 0.0
@@ -167,7 +167,7 @@ def _outermost(view: View, ends: Array) -> tuple[Array, Array]:
     """
     t = np.arange(-24, 41) * 0.5
     outside, near = t >= 6, np.flatnonzero(t <= 6)
-    wanted, deviation = np.zeros((4, 2)), np.tile(DEVIATIONS, (4, 1))
+    wanted, deviation = np.zeros((4, 2)), np.tile(np.array(PASSES[-1][-2:]) / 2, (4, 1))
     for k, side in enumerate(ends):
         change, u = _changes(view, side, t, BLUR)
         size = np.sqrt((change**2).sum(0))
@@ -184,7 +184,7 @@ def _outermost(view: View, ends: Array) -> tuple[Array, Array]:
             line = np.linalg.solve(a.T @ (weight[:, None] * a) + 1e-6 * np.eye(2),
                                    a.T @ (weight * peak[some]))  # fmt: skip
         if np.sum(np.abs(peak[some] - a @ line) < 1) > MOST * len(u):
-            wanted[k], deviation[k] = line, SURE
+            wanted[k], deviation[k] = line, BORDER
     return wanted.ravel(), deviation.ravel()
 
 
@@ -238,11 +238,14 @@ class _Sides:
     wide: Array
     whole: Array
 
+    def sharp(self) -> NDArray[np.bool_]:
+        """Which are lines, as textures make none, (4,)."""
+        return np.asarray((self.tenth > FOUND) & (self.most > MOST))
+
     def plain(self) -> bool:
-        """Whether three are lines that textures do not make."""
-        sharp = (self.tenth > FOUND) & (self.most > MOST)
+        """Whether three are lines, or steps."""
         step = (self.wide > FOUND) & (self.whole > WHOLE)
-        return max(sharp.sum(), step.sum()) >= 3
+        return bool(max(self.sharp().sum(), step.sum()) >= 3)
 
 
 def _sides(view: View, rig: Rig) -> _Sides:
