@@ -109,6 +109,8 @@ def _guide(figure: Any, rig: Rig) -> None:
     fov, focal = rig.fov, needed_focal(rig)
     for i, line in enumerate((
         "Lay the sample flat, stand the ball beside it; page 2 is a template for both.",
+        "On a sample larger than its square lay page 2 with the square cut out: its edge tells where "
+        "the camera was.",
         "Show the pattern at its real size and full brightness; switch off automatic brightness, "
         "night light and tone adaptation.",
         f"Hold the display {h:.0f} mm above the table, face down and level, its top edge where the "
@@ -123,8 +125,8 @@ def _guide(figure: Any, rig: Rig) -> None:
         "the ball's view.",
         "invrender inspect FOLDER tells whether it was a good one.",
     )):  # fmt: skip
-        text(MARGIN, y - 5.6 * i, f"{i + 1}.", size=8.5, color=SOFT)
-        text(MARGIN + 6, y - 5.6 * i, line, size=8.2, color=INK)
+        text(MARGIN, y - 5.1 * i, f"{i + 1}.", size=8.5, color=SOFT)
+        text(MARGIN + 6, y - 5.1 * i, line, size=8.2, color=INK)
 
 
 def _template(figure: Any, rig: Rig) -> None:
@@ -141,7 +143,7 @@ def _template(figure: Any, rig: Rig) -> None:
         page.text(MARGIN, -60, "This rig does not fit on A4: measure from page 1.", size=11)
         return
     place = _axes(figure, (PAGE[0] - width) / 2 + half, 60 + max(half, r), 1)
-    # Corners only: the photo must not show lines at the sample's border.
+    # Corners only: a line along the sample's border would hide its edge.
     for sx in (-1, 1):
         for sy in (-1, 1):
             place.plot([sx * half, sx * half, sx * (half - 8)],
