@@ -165,8 +165,8 @@ def _outermost(view: View, ends: Array) -> tuple[Array, Array]:
     A sample has lines beside its border, a plain table has none: from outside inwards the first
     change that is no table's is the border. A side beside a table that changes as much stays.
     """
-    t = np.arange(-24, 41) * 0.5
-    outside, near = t >= 6, np.flatnonzero(t <= 6)
+    t = np.arange(-24, 49) * 0.5
+    outside, near = t >= 9, np.flatnonzero(t <= 9)
     wanted, deviation = np.zeros((4, 2)), np.tile(np.array(PASSES[-1][-2:]) / 2, (4, 1))
     for k, side in enumerate(ends):
         change, u = _changes(view, side, t, BLUR)
