@@ -36,6 +36,7 @@ SURE, LIKELY = 0.8, 0.65  # confidences from which no other place is tried; wher
 ALIKE = 0.003  # radii between two balls that count as one
 MIRROR_WEIGHT = 1.0
 OUTLINE_WEIGHT = 0.5  # of the outline beside the horizon: a mirror pales into the table there
+UNLEVEL = 0.9  # confidence at most where nothing else tells the camera's tilt
 UNSURE = 0.0012  # deviation of the radius, relative, that takes half of `DOUBT` of the confidence
 DOUBT = 0.4
 FINE = 64  # pixels; the ball's radius in the view of the last fit
@@ -99,6 +100,8 @@ def find_ball(
         if found.confidence > (LIKELY if alike else SURE):
             break
     ball = max(balls, key=lambda b: b.confidence)
+    if tilt >= TILT_PRIOR:
+        ball = replace(ball, confidence=min(ball.confidence, UNLEVEL))
     (x, y), r = ball.centre, ball.radius
     if ball.confidence < MIN_CONFIDENCE:
         raise InputError(

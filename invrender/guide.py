@@ -109,8 +109,8 @@ def _guide(figure: Any, rig: Rig) -> None:
     fov, focal = rig.fov, needed_focal(rig)
     for i, line in enumerate((
         "Lay the sample flat, stand the ball beside it; page 2 is a template for both.",
-        "On a sample larger than its square lay page 2 with the square cut out: its edge tells where "
-        "the camera was.",
+        "On a sample larger than its square lay page 2 with the square cut out: its edge tells "
+        "where the camera was.",
         "Show the pattern at its real size and full brightness; switch off automatic brightness, "
         "night light and tone adaptation.",
         f"Hold the display {h:.0f} mm above the table, face down and level, its top edge where the "

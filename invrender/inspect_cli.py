@@ -63,6 +63,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
         check_photo(photo, str(args.capture))
         rig = Rig() if photo.fov is None else Rig(fov=photo.fov)
         capture = Capture(photo, rig, default_pattern())
+    told = capture.rig
     capture, ball, turned = find_upright_ball(capture, args.ball)
     lights = extract_lights(capture, ball)
     numbers = summary(capture, ball, lights)
@@ -83,6 +84,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     for line in (
         f"photo   {capture.photo.width} × {capture.photo.height} pixels, field of view "
         f"{capture.rig.fov:.1f}°",
+        f"camera  {_moved(told, capture.rig)}",
         f"ball    at {x:.1f}, {y:.1f}, radius {ball.radius:.1f} pixels, "
         + ("given by hand" if args.ball else f"confidence {ball.confidence:.2f}"),
         f"screen  radiance of white {gain}; pattern fits to {fit['residual']:.1%}, display's gamma "
@@ -94,6 +96,17 @@ def run(args: argparse.Namespace, console: Console) -> int:
     for warning in numbers["warnings"]:
         console.print(f"warning: {warning}", markup=False, highlight=False, soft_wrap=True)
     return 0
+
+
+def _moved(told: Rig, found: Rig) -> str:
+    if found.camera_shift == told.camera_shift:
+        return "where the rig puts it"
+    shift = np.subtract(found.camera_shift, told.camera_shift)
+    tilt = np.subtract(found.camera_tilt, told.camera_tilt)
+    return (
+        f"{1000 * np.linalg.norm(shift):.1f} mm and {np.linalg.norm(tilt):.1f}° from where the rig "
+        "puts it, by the sample's square"
+    )
 
 
 def summary(capture: Capture, ball: Ball, lights: Lights) -> dict[str, Any]:

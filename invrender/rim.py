@@ -45,7 +45,6 @@ LUMA = (0.2126, 0.7152, 0.0722)  # a JPEG has its colours at half the resolution
 # of its blur in the view's pixels and of the mirror's reflectance over the rig's.
 _TILT, _BLUR, _MIRROR = slice(3, 5), 5, 6
 TILT_PRIOR, BLUR_PRIOR, MIRROR_PRIOR = 1.5, 0.15, 0.01
-SQUARE_TILT = 0.3  # deviation of a tilt that the sample's square tells (`invrender.square`)
 USUAL_BLUR = 0.8
 OUT = 4.0  # spreads
 ROBUST = 1.25  # spreads from which a residual counts less

@@ -43,45 +43,48 @@ MISFIT, UNLIKELY = 25.0, 14.0  # squared deviations: of the lines, two are left;
 # four logarithms): a sample may have lines of its own.
 FOUND, MOST, WHOLE, TOLD, BETTER = 2.0, 0.5, 10.0, 12.0, 1.8
 MOVED = 0.004  # of a side, from which a found pose is believed rather than the told one
+FOUND_TILT, TOLD_TILT = 0.3, 0.5  # what to expect of the tilt, degrees, as found and as told
 _CORNERS = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) / 2
 
 
-def find_camera(photo: Photo, rig: Rig) -> Rig:
-    """The rig with its camera where the photo's square of the sample says.
+def find_camera(photo: Photo, rig: Rig) -> tuple[Rig, float]:
+    """The rig with its camera where the photo's square of the sample says; and the deviation to
+    expect of the camera's tilt, in degrees.
 
     As told where the square is as plain there, or plain nowhere near.
     """
     try:
         pose = _find(photo, rig)
     except InputError:  # a camera that no rig may have
-        return rig
+        pose = None
     if pose is None:
-        return rig
+        return rig, TILT
     at = [corners(photo, r) for r in (rig, _posed(rig, pose))]
     moved = np.linalg.norm(at[1] - at[0], axis=-1).mean()
-    return _posed(rig, pose) if moved > MOVED * np.linalg.norm(at[0][1] - at[0][0]) else rig
+    if moved > MOVED * np.linalg.norm(at[0][1] - at[0][0]):
+        return _posed(rig, pose), FOUND_TILT
+    return rig, TOLD_TILT
 
 
 def _find(photo: Photo, rig: Rig) -> Array | None:
-    """The camera's pose, in deviations of the prior; None where it is better taken as told."""
+    """The camera's pose, in deviations of the prior; None where the square is plain nowhere."""
     views = [_view(photo, rig, pixels) for pixels, *_ in PASSES]
     told = _sides(views[-1], rig)
-    if told.sharp().all():
-        return None
     pose: Array = np.zeros(6)
+    if told.sharp().all():
+        return pose
     misfit = 0.0
     for view, (_, reach, turns, askew, step, *deviations) in zip(views, PASSES, strict=True):
         for _ in range(turns):
             if not _inside(view, _ends(view, _posed(rig, pose))):
                 return None
             pose, misfit = _improve(view, rig, pose, reach, askew, step, np.tile(deviations, 4))
-    if misfit > MISFIT or pose @ pose > UNLIKELY:
-        return None
     found = _sides(view, _posed(rig, pose))
-    if not found.plain():
-        return None
+    likely = misfit <= MISFIT and pose @ pose <= UNLIKELY and found.plain()
     better = np.log(found.on / told.on).sum() > BETTER
-    if not better and np.sum(told.median > TOLD) >= 3:
+    if np.sum(told.median > TOLD) >= 3 and not (likely and better):
+        return np.zeros(6)
+    if not likely:
         return None
     for _ in range(2):
         border = _outermost(view, _ends(view, _posed(rig, pose)))

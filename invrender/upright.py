@@ -22,7 +22,6 @@ from invrender.images import Photo
 from invrender.mirror import Ball, place_ball
 from invrender.pattern import resize_pattern
 from invrender.rig import Rig
-from invrender.rim import SQUARE_TILT, TILT_PRIOR
 from invrender.square import find_camera
 from invrender.unfold import unfold_pattern
 
@@ -85,8 +84,8 @@ def find_upright_ball(
 def posed(capture: Capture) -> tuple[Capture, float]:
     """The capture with its camera where the sample's square is seen from, if that is plain; and the
     deviation to expect of the camera's tilt in degrees."""
-    rig = find_camera(capture.photo, capture.rig)
-    return replace(capture, rig=rig), TILT_PRIOR if rig is capture.rig else SQUARE_TILT
+    rig, tilt = find_camera(capture.photo, capture.rig)
+    return replace(capture, rig=rig), tilt
 
 
 def _orientation(capture: Capture, ball: Ball) -> tuple[tuple[int, int, bool], float]:
