@@ -100,7 +100,7 @@ def find_ball(
         if found.confidence > (LIKELY if alike else SURE):
             break
     ball = max(balls, key=lambda b: b.confidence)
-    if tilt >= TILT_PRIOR:
+    if tilt > TILT_PRIOR:
         ball = replace(ball, confidence=min(ball.confidence, UNLEVEL))
     (x, y), r = ball.centre, ball.radius
     if ball.confidence < MIN_CONFIDENCE:

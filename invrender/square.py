@@ -43,7 +43,8 @@ MISFIT, UNLIKELY = 25.0, 14.0  # squared deviations: of the lines, two are left;
 # four logarithms): a sample may have lines of its own.
 FOUND, MOST, WHOLE, TOLD, BETTER = 2.0, 0.5, 10.0, 12.0, 1.8
 MOVED = 0.004  # of a side, from which a found pose is believed rather than the told one
-FOUND_TILT, TOLD_TILT = 0.3, 0.5  # what to expect of the tilt, degrees, as found and as told
+# What to expect of the tilt, degrees: as found, as told and seen, as told.
+FOUND_TILT, SEEN_TILT, TOLD_TILT = 0.3, 1.5, 2.0
 _CORNERS = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) / 2
 
 
@@ -58,12 +59,12 @@ def find_camera(photo: Photo, rig: Rig) -> tuple[Rig, float]:
     except InputError:  # a camera that no rig may have
         pose = None
     if pose is None:
-        return rig, TILT
+        return rig, TOLD_TILT
     at = [corners(photo, r) for r in (rig, _posed(rig, pose))]
     moved = np.linalg.norm(at[1] - at[0], axis=-1).mean()
     if moved > MOVED * np.linalg.norm(at[0][1] - at[0][0]):
         return _posed(rig, pose), FOUND_TILT
-    return rig, TOLD_TILT
+    return rig, SEEN_TILT
 
 
 def _find(photo: Photo, rig: Rig) -> Array | None:
