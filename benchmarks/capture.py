@@ -37,7 +37,7 @@ from invrender.square import corners
 from invrender.unfold import room_irradiance
 from invrender.upright import find_upright_ball, posed
 
-SEED = 2000  # photos from here on serve for nothing else
+SEED = 3000  # photos from here on serve for nothing else
 SURE = 0.9  # confidence from which a wrong ball counts
 HEADER = [
     "photo",
