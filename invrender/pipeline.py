@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from invrender.capture import (
     Capture,
@@ -111,10 +112,12 @@ def see(
             capture, _ = posed(capture)
         lights = known_lights(capture, environment, gain)
     else:
-        with stage("ball"):
-            capture, found, turned = find_upright_ball(capture, ball)
-        with stage("lights"):
-            lights = extract_lights(capture, found)
+        # The matrices are small: more threads than one only get in each other's way.
+        with threadpool_limits(1, "blas"):
+            with stage("ball"):
+                capture, found, turned = find_upright_ball(capture, ball)
+            with stage("lights"):
+                lights = extract_lights(capture, found)
         if environment is not None:
             lights = replace(lights, environment=environment)
         if gain is not None:
