@@ -55,13 +55,29 @@ class Lobe:
         return ((weight * rest) ** 2).sum(-1)
 
 
-def fit_lobes(photo: Array, prepared: Tables | Unbiased, samples: int = 64) -> Maps:
-    """Maps of a flat sample with up to `MATERIALS` lobes for a photo (H, W, 3), linear radiance."""
+def lobe_terms(
+    prepared: Tables | Unbiased, height: int, width: int, samples: int = 64
+) -> list[list[Array]]:
+    """E, B and A of a photo's pixels as it is fitted, for each of `ROUGHNESS`."""
+    h, w = min(FIT_SIZE, height), min(FIT_SIZE, width)
+    return [_terms(prepared, h, w, float(rho), samples) for rho in ROUGHNESS]
+
+
+def fit_lobes(
+    photo: Array,
+    prepared: Tables | Unbiased,
+    samples: int = 64,
+    terms: list[list[Array]] | None = None,
+) -> Maps:
+    """Maps of a flat sample with up to `MATERIALS` lobes for a photo (H, W, 3), linear radiance.
+
+    terms: `lobe_terms` of these lights, where several photos are taken under them.
+    """
     height, width = photo.shape[:2]
     h, w = min(FIT_SIZE, height), min(FIT_SIZE, width)
     rows, columns = _centres(h, height), _centres(w, width)
     small = photo[np.ix_(rows, columns)]
-    terms = [_terms(prepared, h, w, float(rho), samples) for rho in ROUGHNESS]
+    terms = terms or lobe_terms(prepared, height, width, samples)
 
     rho = int(np.abs(ROUGHNESS - USUAL_ROUGHNESS).argmin())
     usual = Lobe(rho, np.full(3, USUAL_SPECULAR), np.ones(3))

@@ -42,6 +42,7 @@ MISFIT, UNLIKELY = 25.0, 14.0  # squared deviations: of the lines, two are left;
 # the median; then it is kept, unless the changes found elsewhere are that much larger (a sum of
 # four logarithms): a sample may have lines of its own.
 FOUND, MOST, WHOLE, TOLD, BETTER = 2.0, 0.5, 10.0, 12.0, 1.8
+LEAST_SIDE = 32  # pixels of a side that tells anything
 MOVED = 0.004  # of a side, from which a found pose is believed rather than the told one
 # What to expect of the tilt, degrees: as found, as told and seen, as told.
 FOUND_TILT, SEEN_TILT, TOLD_TILT = 0.3, 1.5, 2.0
@@ -69,6 +70,8 @@ def find_camera(photo: Photo, rig: Rig) -> tuple[Rig, float]:
 
 def _find(photo: Photo, rig: Rig) -> Array | None:
     """The camera's pose, in deviations of the prior; None where the square is plain nowhere."""
+    if not _in_photo(photo, corners(photo, rig)):
+        return None
     views = [_view(photo, rig, pixels) for pixels, *_ in PASSES]
     told = _sides(views[-1], rig)
     pose: Array = np.zeros(6)
@@ -91,6 +94,13 @@ def _find(photo: Photo, rig: Rig) -> Array | None:
         border = _outermost(view, _ends(view, _posed(rig, pose)))
         pose = pose + _solve(_slopes(view, rig, pose), pose, *border)
     return pose
+
+
+def _in_photo(photo: Photo, at: Array) -> bool:
+    """Whether a square with those corners is about in the photo, and large enough."""
+    size, middle = np.array([photo.width, photo.height]), at.mean(0)
+    near = np.all((at > -size) & (at < 2 * size)) and np.all((middle > 0) & (middle < size))
+    return bool(near and np.ptp(at, 0).min() > LEAST_SIDE)
 
 
 def corners(photo: Photo, rig: Rig) -> Array:

@@ -28,7 +28,7 @@ from invrender.backend import dr
 from invrender.cluster import map_tasks
 from invrender.environments import find_environments, scale_environment
 from invrender.errors import InputError
-from invrender.lobes import fit_lobes
+from invrender.lobes import fit_lobes, lobe_terms
 from invrender.maps import Maps
 from invrender.materials import find_materials
 from invrender.render import Tables, Unbiased, material_from_maps, prepare, radiance
@@ -78,6 +78,7 @@ def make_group(rng: np.random.Generator, options: Options) -> list[Sample]:
     room = prepare(make_scene(true, np.ones_like(pattern), env, gain=0.0))
     screens = [prepare(make_scene(true, p, None, g)) for p, g in ((shown, 1.0), (pattern, gain))]
     known_lights = prepare(make_scene(known, pattern, seen, gain))
+    terms = lobe_terms(known_lights, size, size, options.samples)
     out = []
     for _ in range(options.per_room):
         maps = draw_material(rng, options)
@@ -92,7 +93,7 @@ def make_group(rng: np.random.Generator, options: Options) -> list[Sample]:
             packed = _pack(sample, unit, maps)
             if problems(packed):
                 continue
-            lobes = fit_lobes(photo, known_lights, options.samples)
+            lobes = fit_lobes(photo, known_lights, options.samples, terms)
             packed["lobes"] = lobe_input(lobes).astype(np.float16)
             if options.network:
                 packed = _for_correction(packed, unit, known_lights, lobes, options)

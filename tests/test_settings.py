@@ -106,6 +106,7 @@ def test_a_rig_is_refused_or_its_geometry_is_finite(folder, changes):
 @given(st.dictionaries(st.sampled_from(list(_KEYS)), VALUE, min_size=1, max_size=2))
 @example({("camera", "tilt"): [37.0, 0.0, 0.0]})  # past the ball
 @example({("camera", "tilt"): [66.0, 0.0, 0.0]})
+@example({("screen", "size"): 89})  # a sample beyond the photo
 def test_inspect_refuses_a_rig_or_reads_the_lights(folder, changes):
     write(folder, changes)
     code, error = run("inspect", folder, "--json")
