@@ -75,7 +75,7 @@ def _find(photo: Photo, rig: Rig) -> Array | None:
     views = [_view(photo, rig, pixels) for pixels, *_ in PASSES]
     told = _sides(views[-1], rig)
     pose: Array = np.zeros(6)
-    if told.sharp().all():
+    if np.all(told.median > TOLD):  # all four: no need to look elsewhere
         return pose
     misfit = 0.0
     for view, (_, reach, turns, askew, step, *deviations) in zip(views, PASSES, strict=True):
@@ -252,14 +252,11 @@ class _Sides:
     wide: Array
     whole: Array
 
-    def sharp(self) -> NDArray[np.bool_]:
-        """Which are lines, as textures make none, (4,)."""
-        return np.asarray((self.tenth > FOUND) & (self.most > MOST))
-
     def plain(self) -> bool:
-        """Whether three are lines, or steps."""
+        """Whether three are lines, or steps, as textures make none."""
+        sharp = (self.tenth > FOUND) & (self.most > MOST)
         step = (self.wide > FOUND) & (self.whole > WHOLE)
-        return bool(max(self.sharp().sum(), step.sum()) >= 3)
+        return bool(max(sharp.sum(), step.sum()) >= 3)
 
 
 def _sides(view: View, rig: Rig) -> _Sides:
