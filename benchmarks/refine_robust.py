@@ -59,7 +59,7 @@ def make_captures(
 def main() -> None:
     parser = arguments(__doc__, "one small sample, under a minute", 8)
     args = parser.parse_args()
-    count, size, width, spp = (1, 96, 480, 8) if args.quick else (args.count, 256, 960, 32)
+    count, size, width, spp = (1, 96, 640, 16) if args.quick else (args.count, 256, 960, 32)
     rows: dict[str, list[dict[str, Any]]] = {}
     for k in range(count):
         folders = make_captures(
