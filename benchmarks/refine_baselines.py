@@ -39,8 +39,7 @@ from invrender.pipeline import Seen, Stages, see
 from invrender.prior import Prior, network_prior, project, to_maps, to_theta
 from invrender.refine import PHOTO_NOISE, SHARE, Shot, correct, linearise, refine
 from nets.clues import light_inputs
-from nets.infer import Corrector, Reconstructor, lobe_input
-from nets.loader import positions
+from nets.infer import Corrector, Reconstructor, batch_of
 
 Array = Any
 Gradient = Callable[[Array, int], tuple[float, Array]]
@@ -257,11 +256,7 @@ def adapt(problem: Problem, rate: float, seconds: float, limit: int) -> tuple[fl
     inputs = light_inputs(
         lights.rig, lights.pattern, lights.gain, lights.environment, lights.pattern_captured
     )
-    batch = {k: torch.from_numpy(v)[None] for k, v in inputs.items()}
-    batch["photo"] = torch.from_numpy(np.ascontiguousarray(problem.photo.transpose(2, 0, 1)))[None]
-    batch["position"] = positions(problem.n, problem.n)[None]
-    if problem.estimate.lobes is not None:
-        batch["lobes"] = torch.from_numpy(lobe_input(problem.estimate.lobes))[None]
+    batch = batch_of(problem.photo, inputs, problem.estimate.lobes)
     network = copy.deepcopy(problem.network.network).requires_grad_()
     optimiser = torch.optim.Adam(network.parameters(), rate)
     spent, least, curve = 0.0, np.inf, []

@@ -162,7 +162,7 @@ def crop_sample(photo: Photo, rig: Rig, size: int = 256) -> Array:
         raise InputError(f"the sample's size must be at least one pixel, got {size}")
     h, w = photo.height, photo.width
     corners = sample_corners(photo, rig)
-    low, high = corners.reshape(-1, 2).min(0), corners.reshape(-1, 2).max(0)
+    low, high = corners.min(0), corners.max(0)
     x0, y0 = np.maximum(np.floor(low).astype(int) - 8, 0)
     x1, y1 = np.minimum(np.ceil(high).astype(int) + 8, [w, h])
     crop = photo.image[y0:y1, x0:x1]
@@ -184,7 +184,7 @@ def crop_sample(photo: Photo, rig: Rig, size: int = 256) -> Array:
 
 def crop_mask(photo: Photo, rig: Rig, size: int) -> NDArray[np.bool_]:
     """(size, size): pixels of the sample's crop that a saturated photo pixel touches."""
-    corners = sample_corners(photo, rig).reshape(-1, 2)
+    corners = sample_corners(photo, rig)
     x0, y0 = np.maximum(np.floor(corners.min(0)).astype(int) - 10, 0)
     x1, y1 = np.ceil(corners.max(0)).astype(int) + 10
     clipped = photo.clipped
@@ -196,12 +196,12 @@ def crop_mask(photo: Photo, rig: Rig, size: int) -> NDArray[np.bool_]:
 
 
 def sample_corners(photo: Photo, rig: Rig) -> Array:
-    """The sample's corners in photo pixels, (2, 2, 2).
+    """The sample's corners in photo pixels, (4, 2), one after another around it.
 
     Raises `InputError` if the sample is not whole in the photo.
     """
     h, w = photo.height, photo.width
-    corners = rig.project(rig.sample_points(2, 2) * 2, h, w)
+    corners = rig.project(rig.sample_corners, h, w)
     if not (
         np.isfinite(corners).all()
         and (corners >= -0.5).all()

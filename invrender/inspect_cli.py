@@ -191,9 +191,7 @@ def annotate(photo: Photo, rig: Rig, ball: Ball) -> Image.Image:
     line(outline_points(rig, centre, ball.radius_m), "lime")
     line(horizon_points(rig, centre, ball.radius_m), "yellow")
     line(_screen_image(rig, ball), "red")
-    half = rig.sample_size / 2
-    square = np.array([[-half, -half, 0], [half, -half, 0], [half, half, 0], [-half, half, 0]])
-    line(square, "deepskyblue")
+    line(rig.sample_corners, "deepskyblue")
     return picture
 
 

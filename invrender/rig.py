@@ -91,6 +91,12 @@ class Rig:
         """Side of the square sample, l/2."""
         return self.screen_size / 2
 
+    @property
+    def sample_corners(self) -> Array:
+        """The sample's corners, (4, 3), one after another around it."""
+        square = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+        return square * (self.sample_size / 2)
+
     def sample_points(self, height: int, width: int) -> Array:
         """Centres of an H × W grid of sample pixels, (H, W, 3), row 0 at +y."""
         half = self.sample_size / 2

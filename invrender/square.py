@@ -23,6 +23,7 @@ from invrender.ball_view import View, view_around
 from invrender.errors import InputError
 from invrender.images import Photo
 from invrender.rig import Rig
+from invrender.rim import TILT_PRIOR
 from invrender.unfold import sample_image
 
 Array = NDArray[np.floating[Any]]
@@ -44,9 +45,8 @@ MISFIT, UNLIKELY = 25.0, 14.0  # squared deviations: of the lines, two are left;
 FOUND, MOST, WHOLE, TOLD, BETTER = 2.0, 0.5, 10.0, 12.0, 1.8
 LEAST_SIDE = 32  # pixels of a side that tells anything
 MOVED = 0.004  # of a side, from which a found pose is believed rather than the told one
-# What to expect of the tilt, degrees: as found, as told and seen, as told.
-FOUND_TILT, SEEN_TILT, TOLD_TILT = 0.3, 1.5, 2.0
-_CORNERS = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) / 2
+# What to expect of the tilt, degrees: as found, and as told where no square is seen.
+FOUND_TILT, TOLD_TILT = 0.3, 2.0
 
 
 def find_camera(photo: Photo, rig: Rig) -> tuple[Rig, float]:
@@ -65,7 +65,7 @@ def find_camera(photo: Photo, rig: Rig) -> tuple[Rig, float]:
     moved = np.linalg.norm(at[1] - at[0], axis=-1).mean()
     if moved > MOVED * np.linalg.norm(at[0][1] - at[0][0]):
         return _posed(rig, pose), FOUND_TILT
-    return rig, SEEN_TILT
+    return rig, TILT_PRIOR
 
 
 def _find(photo: Photo, rig: Rig) -> Array | None:
@@ -105,7 +105,7 @@ def _in_photo(photo: Photo, at: Array) -> bool:
 
 def corners(photo: Photo, rig: Rig) -> Array:
     """The sample's corners in photo pixels, (4, 2), one after another around it."""
-    return rig.project(_CORNERS * rig.sample_size, photo.height, photo.width)
+    return rig.project(rig.sample_corners, photo.height, photo.width)
 
 
 def _posed(rig: Rig, pose: Array) -> Rig:
@@ -127,7 +127,7 @@ def _view(photo: Photo, rig: Rig, pixels: float) -> View:
 
 def _ends(view: View, rig: Rig) -> Array:
     """The ends of the square's sides in the view, (side, end, 2)."""
-    at = view.at(_CORNERS * rig.sample_size, rig)
+    at = view.at(rig.sample_corners, rig)
     return np.stack([at, np.roll(at, -1, 0)], 1)
 
 
@@ -143,8 +143,8 @@ def _improve(
     now = _ends(view, _posed(rig, pose))
     length = float(np.linalg.norm(now[:, 1] - now[:, 0], axis=-1).mean())
     best = [_best_lines(view, e, reach * length, askew * length, step) for e in now]
-    wanted = np.array([np.ravel([b[:2] for b in four]) for four in product(*best)])
-    gain = np.array([sum(b[2] for b in four) for four in product(*best)])
+    fours = np.array(list(product(*best)))  # (combination, side, 3)
+    wanted, gain = fours[..., :2].reshape(len(fours), 8), fours[..., 2].sum(-1)
     slopes = _slopes(view, rig, pose)
     moves = _solve(slopes, pose, wanted, deviation)
     misfit = (((wanted - moves @ slopes.T) / deviation) ** 2).sum(-1)

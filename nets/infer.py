@@ -97,16 +97,12 @@ class Reconstructor:
         report(0.3)
 
         def maps_of(photo: Array, progress: Callable[[float], None] | None = None) -> Estimate:
-            batch = {k: torch.from_numpy(v)[None] for k, v in lights.items()}
-            batch["photo"] = torch.from_numpy(np.ascontiguousarray(photo.transpose(2, 0, 1)))[None]
-            batch["position"] = positions(*photo.shape[:2])[None]
             lobes = None
             if self.network.config.lobes:
                 seen = np.clip(np.nan_to_num(photo * scale, posinf=0.0, neginf=0.0), 0, 1e3)
                 lobes = fit_lobes(seen, prepared)
-                batch["lobes"] = torch.from_numpy(lobe_input(lobes))[None]
             kept = keep and _kept(keep, self.notes, photo, *lights.values())
-            out = predict(self.network, batch, progress, kept)
+            out = predict(self.network, batch_of(photo, lights, lobes), progress, kept)
             return replace(estimate_of(out, unit), lobes=lobes)
 
         found = maps_of(photo, partial(_told, report, 0.3, 0.7))
@@ -248,6 +244,16 @@ def linearised(
     }
     out = {k: np.ascontiguousarray(np.moveaxis(v, -1, 0), np.float32) for k, v in images.items()}
     return {**out, "lobes": lobe_input(lobes), "position": positions(height, width).numpy()}
+
+
+def batch_of(photo: Array, lights: dict[str, Array], lobes: Maps | None) -> Batch:
+    """The first network's batch (`nets.model`) of one photo (H, W, 3) and `light_inputs`."""
+    batch = {k: torch.from_numpy(v)[None] for k, v in lights.items()}
+    batch["photo"] = torch.from_numpy(np.ascontiguousarray(photo.transpose(2, 0, 1)))[None]
+    batch["position"] = positions(*photo.shape[:2])[None]
+    if lobes is not None:
+        batch["lobes"] = torch.from_numpy(lobe_input(lobes))[None]
+    return batch
 
 
 def lobe_input(lobes: Maps) -> Array:
