@@ -18,7 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, optimize
 
-from invrender.ball_view import BLURS, TOE, View, curves, view_around
+from invrender.ball_view import (
+    BLURS,
+    TOE,
+    View,
+    horizon_curve,
+    normals,
+    outline_curve,
+    view_around,
+)
 from invrender.errors import InputError
 from invrender.images import Photo
 from invrender.mirror import Ball, is_whole, make_ball, mirror_normals, on_table, place_ball
@@ -32,7 +40,7 @@ RADIUS_PRIOR = 0.10  # how far the ball's radius in pixels may be from what the 
 MIN_RADIUS = 10.0  # pixels; below this the pattern in the ball cannot be read
 SEARCH = 3.0  # how many radii from where the rig puts it the ball is looked for
 MIN_CONFIDENCE = 0.5
-SURE, LIKELY = 0.8, 0.65  # confidences from which no other place is tried; where two agree
+SURE, LIKELY = 0.7, 0.65  # confidences from which no other place is tried; where two agree
 ALIKE = 0.003  # radii between two balls that count as one
 MIRROR_WEIGHT = 1.0
 OUTLINE_WEIGHT = 0.5  # of the outline beside the horizon: a mirror pales into the table there
@@ -151,7 +159,7 @@ def _check_exposure(photo: Photo, ball: Ball) -> None:
         raise InputError("the mirror ball is black in the photo: expose it longer")
 
 
-def _alignment(view: View, curve: Array, normal: Array) -> Array:
+def _alignment(view: View, curve: Array) -> Array:
     """How much of an edge runs along a curve at each of its points, (n,) in [0, 1].
 
     The share of the structure tensor across the curve, with the usual trace added below so that
@@ -160,7 +168,7 @@ def _alignment(view: View, curve: Array, normal: Array) -> Array:
     h, w = view.tensor.shape[:2]
     inside = np.all((curve >= 0.5) & (curve <= [w - 0.5, h - 0.5]), -1)
     xx, xy, yy = (_look(view.tensor[None], 0, curve) * inside[:, None]).T
-    nx, ny = normal[:, 0], normal[:, 1]
+    nx, ny = normals(curve).T
     across = xx * nx * nx + 2 * xy * nx * ny + yy * ny * ny
     return np.asarray(across / (xx + yy + 3 * view.noise))
 
@@ -169,9 +177,10 @@ def _score(
     view: View, rig: Rig, theta: Array, count: int = 96, blur: int = 0
 ) -> tuple[float, float, float, float]:
     """Weighted sum of: the horizon's and the outline's share of edge, the mirrored table's fit."""
-    horizon, hn, outline, on = curves(view, rig, theta, count)
-    h = float(_alignment(view, horizon, hn).mean())
-    o = float(_alignment(view, outline, on).mean())
+    h, o = (
+        float(_alignment(view, curve(view, rig, theta, count)).mean())
+        for curve in (horizon_curve, outline_curve)
+    )
     m = _mirrored(view, rig, theta, blur)
     return h + OUTLINE_WEIGHT * o + MIRROR_WEIGHT * m, h, o, m
 
@@ -267,11 +276,12 @@ def _coarse(view: View, rig: Rig, expected: Ball, keep: int = 8) -> list[Array]:
     xx, xy, yy = (np.pad(a, margin) for a in (xx, xy, yy))
     for scale in np.linspace(1 - RADIUS_PRIOR, 1 + RADIUS_PRIOR, 6):
         theta = np.array([centre[0], centre[1], expected.radius_m * scale])
-        hc, hn, oc, on = curves(view, rig, theta, 48)
         total = np.zeros((h, w), np.float32)
-        for curve, normal, weight in ((hc, hn, 1.0), (oc, on, OUTLINE_WEIGHT)):
+        for find, weight in ((horizon_curve, 1.0), (outline_curve, OUTLINE_WEIGHT)):
+            curve = find(view, rig, theta, 48)
             shifts = np.round((curve - middle) / 2).astype(int) + margin
-            for (sx, sy), (nx, ny) in zip(shifts, normal.astype(np.float32), strict=True):
+            across = normals(curve).astype(np.float32)
+            for (sx, sy), (nx, ny) in zip(shifts, across, strict=True):
                 part = slice(sy, sy + h), slice(sx, sx + w)
                 total += np.float32(weight / 48) * (
                     xx[part] * (nx * nx) + xy[part] * (2 * nx * ny) + yy[part] * (ny * ny)

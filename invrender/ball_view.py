@@ -83,18 +83,22 @@ def view_around(photo: Photo, middle: Array, reach: float, shrink: float) -> Vie
     )
 
 
-def curves(view: View, rig: Rig, theta: Array, count: int) -> tuple[Array, Array, Array, Array]:
-    """Horizon and outline in the view, each with its outward unit normals: (n, 2) four times.
-
-    theta: the ball's (x, y, radius) in metres.
-    """
-    position = np.array([theta[0], theta[1], 0.0])
-    horizon = view.at(horizon_points(rig, position, theta[2], count), rig)
-    outline = view.at(outline_points(rig, position, theta[2], count), rig)
-    return horizon, _normals(horizon), outline, _normals(outline)
+def horizon_curve(view: View, rig: Rig, theta: Array, count: int) -> Array:
+    """The horizon's image in the view (count, 2) with the ball at ``theta``: x, y, radius."""
+    return view.at(horizon_points(rig, _place(theta), theta[2], count), rig)
 
 
-def _normals(curve: Array) -> Array:
+def outline_curve(view: View, rig: Rig, theta: Array, count: int) -> Array:
+    """The ball's outline in the view, likewise."""
+    return view.at(outline_points(rig, _place(theta), theta[2], count), rig)
+
+
+def _place(theta: Array) -> Array:
+    return np.array([theta[0], theta[1], 0.0])
+
+
+def normals(curve: Array) -> Array:
+    """Outward unit normals (n, 2) of a closed curve (n, 2)."""
     along = np.roll(curve, -1, 0) - np.roll(curve, 1, 0)
     normal = np.stack([along[:, 1], -along[:, 0]], -1)
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)

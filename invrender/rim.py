@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from invrender.ball_view import View, curves, edges
+from invrender.ball_view import View, edges, horizon_curve, normals, outline_curve
 from invrender.rig import Rig
 from invrender.unfold import sample_image
 
@@ -78,7 +78,7 @@ def fit_rim(
     what the rig tells, degrees.
     """
     p = np.array([*theta, 0.0, 0.0, math.log(USUAL_BLUR), 0.0])
-    light = _mend(view.image @ np.array(LUMA))
+    light = _mend(view.image @ np.array(LUMA, np.float32))
     for count, blur, limit, turns, scales in STAGES:
         lines = _Lines(view, light, rig, p, count, blur, limit, tilt)
         starts = [p * [1, 1, k, 1, 1, 1, 1] for k in scales]
@@ -99,6 +99,11 @@ def _tilted(rig: Rig, p: Array) -> Rig:
 @lru_cache(maxsize=64)
 def _turned(rig: Rig, x: float, y: float) -> Rig:
     return replace(rig, camera_tilt=tuple(np.add(rig.camera_tilt, [x, y, 0])))
+
+
+def _single(x: Array) -> Array:
+    """Single precision: for what is as large as lines times points, which is what takes time."""
+    return x.astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -149,13 +154,13 @@ class _Lines:
         self.view, self.rig, self.blur, self.limit = view, rig, blur, limit
         self.light = ndimage.gaussian_filter(light, blur) if blur else light
         self.farther = ndimage.gaussian_filter(light, blur + 1)
-        outline = curves(view, _tilted(rig, p), p, 2)[2]
+        outline = outline_curve(view, _tilted(rig, p), p, 2)
         self.radius = float(np.linalg.norm(outline[1] - outline[0])) / 2
         angle = np.arange(count) * (2 * math.pi / count)
         self.along = np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], -1)
         low, high = NEAREST * self.radius, limit * self.radius - 1
         self.samples = np.arange(math.ceil(low), math.floor(high) + 1.0)
-        self.points = np.arange(low - 4 + 0.5 / FINE, high + 4, 1 / FINE)
+        self.points = _single(np.arange(low - 4 + 0.5 / FINE, high + 4, 1 / FINE))
         self.nodes = max(4, round(1 + (limit - 1) / (SPACING * (1 + blur))))
         bend = np.diff(np.eye(self.nodes), 2, axis=0)
         self.bend = bend.T @ bend / ROUGH**2
@@ -184,31 +189,32 @@ class _Lines:
         focal = rig.focal(view.size[1]) / view.step
         start = -to_camera / (to_camera @ rig.camera_axes[2])
         turn = (line * [1 / focal, -1 / focal]) @ rig.camera_axes[:2]
-        ray_x = (self.along @ start)[:, None] + (turn * self.along).sum(-1)[:, None] * self.points
-        ray_y = (up @ start)[:, None] + (turn * up).sum(-1)[:, None] * self.points
+        ray_x, ray_y = (
+            _single(a @ start)[:, None] + _single((turn * a).sum(-1))[:, None] * self.points
+            for a in (self.along, up)
+        )
         length = np.sqrt(ray_x * ray_x + ray_y * ray_y)
         ray_x, ray_y = ray_x / length, ray_y / length
-        camera_x, camera_y = camera_x[:, None], camera_y[:, None]
-        direct = np.abs(camera_x - ray_x * (camera_y / ray_y)) / radius
-        along = -(camera_x * ray_x + camera_y * ray_y)
-        offset = camera_x**2 + camera_y**2 - radius * radius
-        distance = along - np.sqrt(np.maximum(along * along - offset, 0))
-        x, y = camera_x + distance * ray_x, camera_y + distance * ray_y
-        turned = 2 * (ray_x * x + ray_y * y) / radius**2
-        back_x, back_y = ray_x - turned * x, ray_y - turned * y
-        mirrored = np.abs(x - back_x * (y / np.minimum(back_y, -1e-3))) / radius
-        mirrored = np.where(back_y < -0.03, mirrored, np.inf)
+        # In radii: the ray's moment about the centre, and half its way through the circle.
+        moment = _single(camera_x / radius)[:, None] * ray_y
+        moment -= _single(camera_y / radius)[:, None] * ray_x
+        half = np.sqrt(np.maximum(1 - moment * moment, 0))
+        direct = np.abs(moment / ray_y)
+        x, y = moment * ray_y - half * ray_x, -moment * ray_x - half * ray_y
+        back_x, back_y = ray_x + 2 * half * x, ray_y + 2 * half * y
+        mirrored = np.abs(x - back_x * (y / np.minimum(back_y, -1e-3)))
+        mirrored[back_y > -0.03] = np.inf
         # The outline: where a ray touches the circle, or the rim on the table, if it is seen.
         touch = np.arctan2(camera_y, camera_x) - np.arccos(radius / np.hypot(camera_x, camera_y))
-        touch = np.maximum(touch, 0)
+        touch = np.maximum(touch, 0)[:, None]
         edge = np.cos(touch) * self.along + np.sin(touch) * up
         outline = view.at(centre + radius * edge, rig) - middle
         outline = np.sqrt((outline * outline).sum(-1))[:, None]
-        inside = np.clip((outline - self.points) * FINE + 0.5, 0, 1)
+        inside = np.clip((_single(outline) - self.points) * FINE + 0.5, 0, 1)
 
         seen = sample_image(self.light, middle + self.samples[:, None] * line[:, None])
         beyond = (mirrored > self.limit) & (inside > 0)
-        far, hidden = np.zeros(beyond.shape), np.zeros(beyond.shape, bool)
+        far, hidden = np.zeros_like(mirrored), np.zeros(beyond.shape, bool)
         reach = np.minimum(mirrored[beyond], FARTHEST) * radius
         place = view.at(centre + reach[:, None] * self.along[np.nonzero(beyond)[0]], rig)
         shown = (place > 0).all(-1) & (place < self.light.shape[::-1]).all(-1)
@@ -220,12 +226,22 @@ class _Lines:
         """Weights (samples, points) of the camera's blur along a line."""
         sigma = math.hypot(math.exp(p[_BLUR]), self.blur)
         weight = np.exp(-0.5 * ((self.samples[:, None] - self.points) / sigma) ** 2)
-        return np.asarray(weight / weight.sum(1, keepdims=True))
+        return _single(weight / weight.sum(1, keepdims=True))
 
     def node(self, distance: Array) -> Array:
         """Where the unknown table has a distance from the centre, in nodes."""
         last = self.nodes - 1
         return np.clip((distance - 1) * (last / (self.limit - 0.98)), 0, last - 1e-3)
+
+    def hats(self, distance: Array, weight: Array) -> Array:
+        """The nodes' shares of a distance, times ``weight``: (lines, points, nodes)."""
+        q = self.node(distance)
+        i = q.astype(np.intp)
+        out = np.zeros((q.size, self.nodes), np.float32)
+        flat, row = out.reshape(-1), i.ravel() + self.nodes * np.arange(q.size)
+        flat[row + 1] = (weight * (q - i)).ravel()
+        flat[row] = weight.ravel() - flat[row + 1]
+        return out.reshape(*q.shape, self.nodes)
 
     def solve(self, p: Array, spread: float, edge: float, weight: Array | None) -> _Fit:
         """The table that fits best with the ball at ``p``, and how well; ``spread`` and ``edge``:
@@ -235,19 +251,14 @@ class _Lines:
         known = t.inside * (t.mirrored > self.limit)
         valid = (known * t.hidden) @ kernel.T < 0.02
         near = (t.inside - known) * mirror
-        index = np.arange(self.nodes)
-        hats = np.maximum(0, 1 - np.abs(self.node(t.mirrored)[..., None] - index)) * near[..., None]
-        hats += (
-            np.maximum(0, 1 - np.abs(self.node(t.direct)[..., None] - index))
-            * (1 - t.inside)[..., None]
-        )
+        hats = self.hats(t.mirrored, near) + self.hats(t.direct, 1 - t.inside)
         matrix = kernel @ hats
         scale = np.median(t.seen, 1, keepdims=True) + 1e-3 * t.seen.mean() + 1e-9
         right = (t.seen - (known * t.far * mirror) @ kernel.T) / scale
-        weight = valid * (1.0 if weight is None else weight)
+        weight = _single(valid) if weight is None else valid * _single(weight)
         weighted = (matrix * weight[..., None]).transpose(0, 2, 1)
         smooth = spread**2 * self.bend + 1e-6 * np.eye(self.nodes)
-        solver = np.linalg.solve(weighted @ matrix + smooth, weighted)
+        solver = _single(np.linalg.solve(weighted @ matrix + smooth, weighted))
         table = (solver @ right[..., None])[..., 0]
         error = right - (matrix @ table[..., None])[..., 0]
         relative = (error / (ROBUST * spread)) ** 2
@@ -281,7 +292,8 @@ class _Lines:
 
     def horizon(self, p: Array) -> tuple[Array, Array, Array, Array]:
         """The horizon (n, 2), its normals, the signed distance to its edge, and that's weight."""
-        curve, normal = curves(self.view, _tilted(self.rig, p), p, 120)[:2]
+        curve = horizon_curve(self.view, _tilted(self.rig, p), p, 120)
+        normal = normals(curve)
         reach = max(2.0, 0.05 * self.radius * 0.5 ** (3 - self.blur))
         return curve, normal, *edges(self.view, curve, normal, reach)
 
@@ -326,24 +338,22 @@ class _Lines:
     ) -> tuple[Array, Array]:
         """Gauss–Newton's matrix (7, 7) and the gradient (7,), in `units`."""
         base = self.residual(p, fit.trace, fit)
-        columns = []
+        curve, normal, off, strength = fit.horizon
+        lines, horizon = np.zeros((len(p), *base.shape)), np.zeros((len(p), len(curve)))
         for k, unit in enumerate(self.units):
-            # Blur and reflectance move no ray.
-            trace = self.trace(p + unit) if k < _BLUR else fit.trace
-            column = self.residual(p + unit, trace, fit) - base
-            column -= (fit.matrix @ (fit.solver @ column[..., None]))[..., 0]
-            columns.append(column.reshape(-1))
-        slope = np.stack(columns)
+            trace = fit.trace
+            if k < _BLUR:  # blur and reflectance move no ray
+                trace = self.trace(p + unit)
+                moved = horizon_curve(self.view, _tilted(self.rig, p + unit), p + unit, len(curve))
+                horizon[k] = np.sum((moved - curve) * normal, -1)
+            lines[k] = self.residual(p + unit, trace, fit) - base
+        slope = lines - (fit.matrix @ (fit.solver @ lines[..., None]))[..., 0]
+        slope = slope.reshape(len(p), -1)
         weighted = slope * (fit.weight.reshape(-1) / spread**2 / CORRELATED)
         matrix = self.units @ np.diag(self.prior) @ self.units.T + weighted @ slope.T
         gradient = self.units @ (self.prior * self.off(p)) + weighted @ fit.error.reshape(-1)
-        curve, normal, off, strength = fit.horizon
-        slope = np.zeros((len(p), len(curve)))
-        for k, unit in enumerate(self.units[:5]):
-            moved = curves(self.view, _tilted(self.rig, p + unit), p + unit, len(curve))[0]
-            slope[k] = np.sum((moved - curve) * normal, -1)
-        weighted = slope * (strength / (1 + (off / edge) ** 2) / edge**2 / EDGES_CORRELATED)
-        return matrix + weighted @ slope.T, gradient - weighted @ off
+        weighted = horizon * (strength / (1 + (off / edge) ** 2) / edge**2 / EDGES_CORRELATED)
+        return matrix + weighted @ horizon.T, gradient - weighted @ off
 
 
 def _mend(image: Array) -> Array:
