@@ -44,10 +44,10 @@ AXES = np.array([[1, 1, 1], [1, -1, 0], [1, 1, -2]]).T / np.sqrt([3, 2, 6])
 
 def clipped_share(photo: Photo, rig: Rig, ball: Ball, height: int) -> Array:
     """(H, 2H, 3): the share of each texel of the environment whose channel is clipped."""
-    if photo.clip_level is None:
+    area = window(ball)
+    if photo.clip_level is None or photo.image[area].max() < photo.clip_level:
         return np.zeros((height, 2 * height, 3), np.float32)
     full = np.zeros(photo.image.shape, np.float32)
-    area = window(ball)
     full[area] = photo.image[area] >= photo.clip_level
     share, _ = unfold_environment(Photo(full), rig, ball, height)
     return np.asarray(share * np.asarray(rig.ball_reflectance), np.float32)

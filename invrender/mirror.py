@@ -43,11 +43,11 @@ def mirror_normals(rig: Rig, position: Array, radius: float, target: Array, near
     angle between the ways to camera and target; these depend on the point, little, since the ball
     is small: a fixed point with a contraction of about radius/distance.
     """
-    target = np.asarray(target, float)
-    normal = np.broadcast_to(np.array([0.0, 0.0, 1.0]), target.shape)
-    for _ in range(5):
+    target, camera = np.asarray(target, float), rig.camera
+    normal = _unit(_unit(camera - position) + _unit(target - position if near else target))
+    for _ in range(3):
         point = position + radius * normal
-        to_camera = rig.camera - point
+        to_camera = camera - point
         to_target = target - point if near else target
         normal = _unit(_unit(to_camera) + _unit(to_target))
     return normal

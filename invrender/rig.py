@@ -142,10 +142,13 @@ class Rig:
         e_x, e_y = self.screen_edges
         t = (np.arange(cells) + 0.5) / cells
         middle = self.screen_corner + t[:, None] * e_x + (1 - t)[:, None, None] * e_y
+        middle = middle.reshape(-1, 3)
         down = np.cross(e_y, e_x) / cells**2  # as long as a cell's area
-        d = middle - np.asarray(points)[..., None, None, :]
-        cosines = np.maximum(d[..., 2], 0) * np.maximum(-(d @ down), 0)
-        return np.asarray(cosines / (d * d).sum(-1) ** 2)
+        p = np.asarray(points)
+        square = (p * p).sum(-1)[..., None] + (middle * middle).sum(-1) - 2 * p @ middle.T
+        cosines = np.maximum(middle[:, 2] - p[..., 2:], 0)
+        cosines *= np.maximum((p @ down)[..., None] - middle @ down, 0)
+        return np.asarray(cosines / square**2).reshape(*p.shape[:-1], cells, cells)
 
     @property
     def camera(self) -> Array:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, special
+from scipy.spatial.transform import Rotation
 
 from invrender.errors import InputError
 from invrender.images import Photo
@@ -224,12 +225,24 @@ class _Fit:
         )
 
     def forms(self, u: Array) -> Array:
-        """(6, 3): a line times this, (a, b, c), meets the screen's plane at s = a/c, t = b/c."""
-        rig = self.moved(u)
-        (e_x, e_y), corner = rig.screen_edges, rig.screen_corner
-        a = np.concatenate([-e_y, np.cross(e_y, corner)])
-        b = np.concatenate([e_x, np.cross(corner, e_x)])
-        return np.stack([a, b, np.concatenate([np.zeros(3), np.cross(e_x, e_y)])], -1)
+        """(..., 6, 3): a line times this, (a, b, c), meets the screen's plane at s = a/c, t = b/c.
+
+        The unknowns ``u`` (..., 14) may be several.
+        """
+        e_x, e_y, corner = self.screen(u)
+        a = np.concatenate([-e_y, np.cross(e_y, corner)], -1)
+        b = np.concatenate([e_x, np.cross(corner, e_x)], -1)
+        return np.stack([a, b, np.concatenate([0 * e_x, np.cross(e_x, e_y)], -1)], -1)
+
+    def screen(self, u: Array) -> tuple[Array, Array, Array]:
+        """The screen's sides and corner as `moved` has them, (..., 3) each."""
+        tilt = np.asarray(u[..., _TILT] * TILT_PRIOR + self.rig.screen_tilt)
+        turn = Rotation.from_rotvec(tilt.reshape(-1, 3), degrees=True).as_matrix()
+        sides = self.rig.screen_size * turn.reshape(*tilt.shape, 3)
+        e_x, e_y = sides[..., 0], sides[..., 1]
+        level = sum(self.rig.screen_edges) / 2 + self.rig.screen_corner
+        middle = level + u[..., _SHIFT] * SHIFT_PRIOR * self.rig.sample_size
+        return e_x, e_y, middle - (e_x + e_y) / 2
 
     def look(self, u: Array, slopes: bool = False) -> Array:
         """What the pixels average of the screen's pattern, and the screen's share: (1, H, W, 4).
@@ -258,13 +271,12 @@ class _Fit:
                 np.concatenate([d * cover + light * e[..., None], e[..., None]], -1)
                 for d, e in zip(by_place, edges, strict=True)
             )
-            lines = self.lines[on]
-            for k in range(6 if self.free[0] else 0):
-                moved = u.copy()
-                moved[k] += _STEP
-                da, db, dc = np.moveaxis(lines @ ((self.forms(moved) - forms) / _STEP), -1, 0)
-                ds, dt = (((d - q * dc) / c)[..., None] for d, q in ((da, s), (db, t)))
-                parts.append(by_s * ds + by_t * dt)
+            if self.free[0]:
+                change = (self.forms(u + _STEP * np.eye(6, _COUNT)) - forms) / _STEP
+                moved = self.lines[on] @ np.concatenate(list(change), -1)
+                for da, db, dc in np.moveaxis(moved, -1, 0).reshape(6, 3, *s.shape):
+                    ds, dt = (((d - q * dc) / c)[..., None] for d, q in ((da, s), (db, t)))
+                    parts.append(by_s * ds + by_t * dt)
             (curve,) = _look_up(shown * np.log(self.pattern) * gamma, s, t, False)
             parts.append(np.concatenate([curve * cover, 0 * cover], -1))
         out = np.zeros((len(parts), *on.shape, 4))
@@ -395,10 +407,10 @@ class _Fit:
 
     def cost(self, u: Array) -> float:
         """Cauchy's loss of the errors and half the prior's square; no rig, no end of it."""
-        try:
-            seen = self.look(u)[0]
-        except InputError:  # a screen that reaches below the table
+        e_x, e_y, corner = self.screen(u)
+        if not corner[2] + min(e_x[2], 0) + min(e_y[2], 0) > 0:  # it reaches below the table
             return math.inf
+        seen = self.look(u)[0]
         r = self.errors(u, seen)[self.use]
         off = u - self.usual
         return float(ROBUST**2 / 2 * np.log1p((r / ROBUST) ** 2).sum() + off @ self.prior @ off / 2)

@@ -62,17 +62,23 @@ def hidden_by_screen(rig: Rig, points: Array, direction: Array) -> Mask:
 def room_irradiance(rig: Rig, points: Array, environment: Array) -> Array:
     """Irradiance (n, 3) of upward faces at points (n, 3) from the room (H, 2H, 3) that the screen
     does not hide from them."""
-    height = len(environment)
-    half = height // 2
-    d = directions(height, 2 * height)[:half].reshape(-1, 3).astype(float)
-    weight = np.repeat(solid_angles(height, 2 * height)[:half], 2 * height) * d[:, 2]
-    flux = environment[:half].reshape(-1, 3) * weight[:, None]
+    d, flux = sky_flux(environment)
     lit = np.flatnonzero(flux.any(-1))
     out = np.empty((len(points), 3))
     step = max(1, 2_000_000 // max(len(lit), 1))
     for i in range(0, len(points), step):
         out[i : i + step] = ~hidden_by_screen(rig, points[i : i + step], d[lit]) @ flux[lit]
     return out
+
+
+def sky_flux(environment: Array) -> tuple[Array, Array]:
+    """Directions (m, 3) above the horizon of an environment's texels (H, 2H, 3), and what each
+    sends through an upward face of unit area (m, 3)."""
+    height = len(environment)
+    half = height // 2
+    d = directions(height, 2 * height)[:half].reshape(-1, 3).astype(float)
+    weight = np.repeat(solid_angles(height, 2 * height)[:half], 2 * height) * d[:, 2]
+    return d, environment[:half].reshape(-1, 3) * weight[:, None]
 
 
 def trace_ball(rig: Rig, ball: Ball, pixels: Array) -> tuple[Array, Array, Mask]:
