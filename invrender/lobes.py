@@ -29,6 +29,7 @@ SPREAD = 0.25  # of ρ around its usual value
 SPREAD_F0 = (0.005, 0.1)  # of k_s: a lobe as usual, or any
 UNUSUAL = 3.0  # by how much -2 log-likelihood must fall for another than a lobe as usual
 LEAST_F0 = 0.02  # of common materials
+BRIGHTEST = 4.0  # k_d: a white sample under lights told too dark is no metal
 METAL = 0.2  # f0 from which a material may be bare metal
 FIT_SIZE = 128  # pixels a side of the fit: what decides is as wide as the pattern's features
 SMOOTH, GRID = 0.15, 64  # from this ρ on, E, B and A are interpolated from so many pixels a side
@@ -185,16 +186,16 @@ def _weight(photo: Array, pixels: Array) -> Array:
 
 
 def _least_squares(moments: Array, pull: Any, usual: Array) -> tuple[Array, Array, Array]:
-    """k_s from `LEAST_F0` and k_d in [0, 1] of z ≈ k_d·x + k_s·y, and the mean squared residual.
+    """k_s ≥ `LEAST_F0`, k_d ≤ `BRIGHTEST` of z ≈ k_d·x + k_s·y, and their mean squared residual.
 
     moments: the means of xx, xy, yy, xz, yz and zz. pull: weight of (k_s - usual)². Any shapes that
     broadcast.
     """
     xx, xy, yy, xz, yz, zz = moments
     x2, y2, y1 = xx + 1e-20, yy + pull + 1e-20, yz + pull * usual
-    k_d = np.clip((y2 * xz - xy * y1) / np.maximum(x2 * y2 - xy * xy, 1e-30), 0, 1)
+    k_d = np.clip((y2 * xz - xy * y1) / np.maximum(x2 * y2 - xy * xy, 1e-30), 0, BRIGHTEST)
     k_s = np.clip((y1 - xy * k_d) / y2, LEAST_F0, 1)
-    k_d = np.clip((xz - xy * k_s) / x2, 0, 1)
+    k_d = np.clip((xz - xy * k_s) / x2, 0, BRIGHTEST)
     rest = zz - 2 * k_d * xz - 2 * k_s * yz
     rest += k_d * k_d * xx + 2 * k_d * k_s * xy + k_s * k_s * yy
     return k_s, k_d, np.maximum(rest, 0.0)

@@ -86,6 +86,16 @@ def test_lobe_of_a_uniform_sample_is_found(prepared, environment, k_d, k_s, rho)
     assert error["diffuse"] < 0.02
 
 
+def test_white_under_lights_told_too_dark_is_no_metal(prepared, environment):
+    """No albedo is above one, but lights may be told half as bright as they are."""
+    rng = np.random.default_rng(0)
+    truth = constant_maps(SIZE, SIZE, 0.85, 0.04, 0.9)
+    truth.diffuse *= rng.uniform(0.95, 1.05, (SIZE, SIZE, 1)).astype(np.float32)
+    maps = fit_lobes(2.2 * photo_of(truth, environment), prepared)
+    assert maps.specular.max() < 0.1
+    assert maps.diffuse.min() > 0.9
+
+
 def test_two_materials_get_two_lobes(prepared, environment):
     truth = constant_maps(SIZE, SIZE, (0.5, 0.3, 0.1), 0.04, 0.7)
     half = SIZE // 2
