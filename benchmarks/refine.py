@@ -142,6 +142,7 @@ def bars(summary: dict[str, Any]) -> list[dict[str, Any]]:
         bar("worst map, refined over network", max(ratio[n] for n in NAMES), 1, at_least=False),
         bar("re-render RMSE, refined over network", ratio["rerender"], 0.8, at_least=False),
         bar("seconds, median", summary["seconds"]["seconds_refined"], 20, at_least=False),
+        bar("seconds to initial maps", summary["seconds"]["seconds_initial"], 1.8, at_least=False),
         bar("coverage's distance from 68%", abs(covered - SURE), 0.08, at_least=False),
     ]
 

@@ -54,8 +54,7 @@ def add_hidden_lamp(
     seen, at, use, known = lit_table(photo, rig, ball, pattern, gain, environment)
     shading = _Shading(seen, use, known)
     best = None
-    # The filling is smooth: every second texel will do.
-    for k, light in enumerate(_part_lights(rig, at, environment[::2, ::2], part[::2, ::2])):
+    for k, light in enumerate(_part_lights(rig, at, environment, part)):
         for x in shading.starts(light):
             cost = shading.cost(x, light)
             if best is None or cost < best[0]:

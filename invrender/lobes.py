@@ -5,6 +5,9 @@ the albedos once ρ is given. The pattern makes E, B and A differ from place to 
 colour, so many pixels together tell the lobe that one cannot: the roughness that leaves the least,
 of a list, and its k_s by least squares. First for the sample as a whole, then for each group of
 pixels of like albedo. Relief widens the lobe that is found.
+
+Whether a material is bare metal is often a close call: for the networks `read_lobes` tells what the
+photo says of either case, and the odds.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 from scipy.ndimage import uniform_filter
 
+from invrender.clipped import AXES
 from invrender.initial import USUAL_ROUGHNESS, USUAL_SPECULAR, diffuse_rest, plane_terms
 from invrender.maps import Maps
 from invrender.materials import resize
@@ -35,6 +39,11 @@ FIT_SIZE = 128  # pixels a side of the fit: what decides is as wide as the patte
 SMOOTH, GRID = 0.15, 64  # from this ρ on, E, B and A are interpolated from so many pixels a side
 MEASUREMENTS = 100.0  # that a photo's worth of pixels counts for: texture repeats
 MATERIALS, ROUNDS = 4, 4
+LITTLE = 0.3  # of B's mean
+# Of an albedo's texture: the albedo that counts as black, the variance in an octave that counts as
+# none, how many measurements an octave counts for, and how much its volume counts.
+BLACK, EVEN, MEASURED, VOLUME = 0.02, 0.003, 4, 0.85
+WHITER, TOO_WHITE, IMPLAUSIBLE = 1.5, 0.3, 20.0  # albedos, share of pixels, and the cost of those
 
 
 @dataclass(frozen=True)
@@ -49,11 +58,34 @@ class Lobe:
         """What the lobe leaves of the photo, as diffuse albedo."""
         return diffuse_rest(photo, terms, self.f0) * np.float32(self.albedo.any())
 
+    def mirror(self, photo: Array, terms: Any) -> Array:
+        """f0 (H, W, 3) of metal, pixel by pixel; the material's where it mirrors little."""
+        _, b, a = terms
+        usual = LITTLE * b.mean((0, 1))
+        return np.clip((photo - a + usual * self.f0) / (b + usual + 1e-20), 0, 1)
+
     def misfit(self, photo: Array, terms: Any, weight: Array) -> Array:
         """Squared residual (H, W) of the photo if all of it were this material."""
         e, b, a = terms
         rest = photo - self.albedo * e / np.pi - self.f0 * b - a
         return ((weight * rest) ** 2).sum(-1)
+
+
+@dataclass(frozen=True)
+class Lobes:
+    """What a fit finds of a sample: ``maps``, those of each group's likeliest lobe; and, whichever
+    case is likelier, ``readings`` (H, W, 16) and ``costs`` (40,).
+
+    readings: 0 to 3, k_d and ρ of a usual dielectric; 4 to 7, k_s pixel by pixel and ρ of bare
+    metal; 8 to 10, how much likelier metal is (`_squashed`) by the residuals of the group, by those
+    of the sample, by its texture (`_plainness`); 11 and 12, ρ of either case by the texture, the
+    posterior mean; 13 to 15, the group's k_s as metal. costs: -2 log-likelihood of each of
+    `ROUGHNESS` over the least, squashed: by residuals, dielectric and metal, and by texture.
+    """
+
+    maps: Maps
+    readings: Array
+    costs: Array
 
 
 def lobe_terms(
@@ -64,13 +96,18 @@ def lobe_terms(
     return [_terms(prepared, h, w, float(rho), samples) for rho in ROUGHNESS]
 
 
-def fit_lobes(
+def fit_lobes(photo: Array, prepared: Tables | Unbiased, samples: int = 64) -> Maps:
+    """Maps of a flat sample with up to `MATERIALS` lobes for a photo (H, W, 3), linear radiance."""
+    return read_lobes(photo, prepared, samples).maps
+
+
+def read_lobes(
     photo: Array,
     prepared: Tables | Unbiased,
     samples: int = 64,
     terms: list[list[Array]] | None = None,
-) -> Maps:
-    """Maps of a flat sample with up to `MATERIALS` lobes for a photo (H, W, 3), linear radiance.
+) -> Lobes:
+    """`fit_lobes`, and what else the fit tells.
 
     terms: `lobe_terms` of these lights, where several photos are taken under them.
     """
@@ -93,21 +130,51 @@ def fit_lobes(
         label = np.unique(label, return_inverse=True)[1].reshape(h, w)
     lobes = [_fit(moments, label == k, whole) for k in range(int(label.max()) + 1)]
 
+    either = [_either(moments, label == k) for k in range(len(lobes))]
+
     # At full size each pixel chooses among the lobes anew.
     full = {
         rho: terms[rho] if (h, w) == (height, width)
         else _terms(prepared, height, width, float(ROUGHNESS[rho]), samples)
-        for rho in {f.rho for f in lobes}
+        for rho in {f.rho for f in lobes} | {f.rho for e in either for f in e.lobes}
     }  # fmt: skip
     label = _closest(photo, [full[f.rho] for f in lobes], lobes)
     normal = np.zeros((height, width, 3), np.float32)
     normal[..., 2] = 1
-    return Maps(
+    maps = Maps(
         _select(label, [f.diffuse(photo, full[f.rho]) for f in lobes]),
         np.array([f.f0 for f in lobes], np.float32)[label],
         ROUGHNESS[[f.rho for f in lobes]].astype(np.float32)[label],
         normal,
     )
+    sample, texture = _either(moments, np.ones((h, w), bool)), _by_texture(small, terms)
+    costs = np.stack([c - c.min() for c in (sample.costs, texture)])
+    readings = _readings(photo, full, label, either, sample, texture)
+    return Lobes(maps, readings, _squashed(costs).ravel().astype(np.float32))
+
+
+def _readings(
+    photo: Array, terms: dict[int, list[Array]], label: Labels, either: list[_Either],
+    sample: _Either, texture: Array,
+) -> Array:  # fmt: skip
+    """`Lobes.readings`: labels, and the ``sample``, as ``either`` case; costs by ``texture``."""
+    dielectric, metal = zip(*(e.lobes for e in either), strict=True)
+    rho = [ROUGHNESS[[f.rho for f in lobes]][label] for lobes in (dielectric, metal)]
+    weight = np.exp((texture.min(1, keepdims=True) - texture) / 2)
+    odds = _squashed(np.array([sample.odds, texture[0].min() - texture[1].min()]))
+    of_all = [np.full(label.shape, x) for x in (*odds, *(weight @ ROUGHNESS / weight.sum(1)))]
+    parts = [
+        _select(label, [f.diffuse(photo, terms[f.rho]) for f in dielectric]), rho[0],
+        _select(label, [f.mirror(photo, terms[f.rho]) for f in metal]), rho[1],
+        _squashed(np.array([e.odds for e in either]))[label], *of_all,
+        np.array([f.f0 for f in metal])[label],
+    ]  # fmt: skip
+    return np.dstack(parts).astype(np.float32)
+
+
+def _squashed(odds: Array) -> Array:
+    """Odds without their extremes: arsinh of a tenth."""
+    return np.arcsinh(odds / 10)
 
 
 def _terms(
@@ -179,6 +246,62 @@ def _fit(moments: Array, of: NDArray[np.bool_], usual: Lobe) -> Lobe:
     return Lobe(rho, f0[k, rho], albedo[k, rho] if k < 2 else np.zeros(3))
 
 
+@dataclass(frozen=True)
+class _Either:
+    """Pixels as a usual dielectric and as bare metal: the lobes, and -2 log-likelihoods (2, ρ)."""
+
+    lobes: tuple[Lobe, Lobe]
+    costs: Array
+
+    @property
+    def odds(self) -> float:
+        """How much likelier metal is."""
+        return float(self.costs[0].min() - self.costs[1].min())
+
+
+def _either(moments: Array, of: NDArray[np.bool_]) -> _Either:
+    """The pixels ``of`` in either case."""
+    measurements, usual = MEASUREMENTS * float(of.mean()), np.full(3, USUAL_SPECULAR)
+    mean = np.moveaxis(moments @ (of.ravel() / of.sum()), -1, 0)
+    pull = _least_squares(mean, 0.0, usual)[2] / measurements / SPREAD_F0[0] ** 2
+    metal = mean * np.array([0, 0, 1, 0, 1, 1])[:, None, None]
+    f0, _, residual = (
+        np.stack(x)
+        for x in zip(*(_least_squares(m, p, usual) for m, p in ((mean, pull), (metal, 0.0))),
+                     strict=True)
+    )  # fmt: skip
+    costs = measurements * np.log(residual.mean(-1) + 1e-9) + _UNLIKELY
+    i, j = (int(k) for k in costs.argmin(1))
+    return _Either((Lobe(i, f0[0, i], np.ones(3)), Lobe(j, f0[1, j], np.zeros(3))), costs)
+
+
+def _by_texture(photo: Array, terms: list[list[Array]]) -> Array:
+    """-2 log-likelihood (2, ρ) of either case by the sample's texture: a wrong lobe leaves the
+    light's pattern in the albedo that is derived with it."""
+    size = max(4, 1 << max(min(photo.shape[:2]).bit_length() - 3, 0))
+    small = resize(photo, size, size)
+    lit = [[resize(x, size, size) for x in t] for t in terms]
+    costs = [[_plainness(small, e, b, a, metal) for e, b, a in lit] for metal in (False, True)]
+    return np.array(costs) + _UNLIKELY / 4
+
+
+def _plainness(photo: Array, e: Array, b: Array, a: Array, metal: bool) -> float:
+    """-2 log-likelihood of a photo (n, n, 3) whose texture is a Gaussian of the logarithm of k_d,
+    or of k_s for ``metal``, with a variance of its own for each octave and colour axis."""
+    by = np.maximum(b, 0.02 * b.mean()) + 1e-20 if metal else e / np.pi + 1e-20
+    albedo = (photo - a - (0 if metal else USUAL_SPECULAR) * b) / by
+    log = np.log(np.maximum(albedo, 0) + BLACK)
+    volume = float((log + np.log(by)).mean((0, 1)).sum())  # of the photo over that of the texture
+    log, cost = log @ AXES, 0.0
+    while len(log) > 2:
+        coarse = log.reshape(len(log) // 2, 2, len(log) // 2, 2, 3).mean((1, 3))
+        detail = log - np.repeat(np.repeat(coarse, 2, 0), 2, 1)
+        spread = float(np.log((detail**2).mean((0, 1)) + EVEN).sum())
+        cost += MEASURED * (spread / 2 + VOLUME * volume)
+        log = coarse
+    return cost + IMPLAUSIBLE * ((albedo > WHITER).any(-1).mean() > TOO_WHITE)
+
+
 def _weight(photo: Array, pixels: Array) -> Array:
     """Inverse standard deviation of pixels relative to the photo's mean: shot noise and floor."""
     level = photo.mean((0, 1)) + 1e-12
@@ -199,3 +322,6 @@ def _least_squares(moments: Array, pull: Any, usual: Array) -> tuple[Array, Arra
     rest = zz - 2 * k_d * xz - 2 * k_s * yz
     rest += k_d * k_d * xx + 2 * k_d * k_s * xy + k_s * k_s * yy
     return k_s, k_d, np.maximum(rest, 0.0)
+
+
+_UNLIKELY = ((ROUGHNESS - USUAL_ROUGHNESS) / SPREAD) ** 2  # -2 log prior of each of the list

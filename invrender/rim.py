@@ -101,9 +101,9 @@ def _turned(rig: Rig, x: float, y: float) -> Rig:
     return replace(rig, camera_tilt=tuple(np.add(rig.camera_tilt, [x, y, 0])))
 
 
-def _single(x: Array) -> Array:
+def _single(x: Any) -> Array:
     """Single precision: for what is as large as lines times points, which is what takes time."""
-    return x.astype(np.float32)
+    return np.asarray(x, np.float32)
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ Mask = NDArray[np.bool_]
 SCREEN_MARGIN, MARGIN_BLURS = 1.5, 1.5
 # A veil over the ball is told from the table that is mirrored from 1.8 radii on.
 BARE = 1.8
+AT_ONCE = 2_000_000  # pairs of a point and a direction
 VEILED = 0.7  # what it must leave of the residuals' cost to be believed
 
 
@@ -49,14 +50,19 @@ def hidden_by_screen(rig: Rig, points: Array, direction: Array) -> Mask:
     e_x, e_y = rig.screen_edges
     normal = np.cross(e_x, e_y)
     from_corner = np.asarray(points) - rig.screen_corner
+    out = np.empty((len(from_corner), len(direction)), bool)
+    step = max(1, AT_ONCE // max(len(direction), 1))
 
-    def along(axis: Array) -> Array:
-        return np.asarray((from_corner @ axis)[:, None] + t * (direction @ axis)) / (axis @ axis)
+    def along(axis: Array, part: Array, t: Array) -> Array:
+        return np.asarray((part @ axis)[:, None] + t * (direction @ axis)) / (axis @ axis)
 
     with np.errstate(divide="ignore", invalid="ignore"):
-        t = -(from_corner @ normal)[:, None] / (direction @ normal)
-        a, b = along(e_x), along(e_y)
-        return np.asarray((t > 0) & (a >= 0) & (a <= 1) & (b >= 0) & (b <= 1))
+        for i in range(0, len(out), step):
+            part = from_corner[i : i + step]
+            t = -(part @ normal)[:, None] / (direction @ normal)
+            a, b = along(e_x, part, t), along(e_y, part, t)
+            out[i : i + step] = (t > 0) & (a >= 0) & (a <= 1) & (b >= 0) & (b <= 1)
+    return out
 
 
 def room_irradiance(rig: Rig, points: Array, environment: Array) -> Array:
@@ -65,7 +71,7 @@ def room_irradiance(rig: Rig, points: Array, environment: Array) -> Array:
     d, flux = sky_flux(environment)
     lit = np.flatnonzero(flux.any(-1))
     out = np.empty((len(points), 3))
-    step = max(1, 2_000_000 // max(len(lit), 1))
+    step = max(1, AT_ONCE // max(len(lit), 1))
     for i in range(0, len(points), step):
         out[i : i + step] = ~hidden_by_screen(rig, points[i : i + step], d[lit]) @ flux[lit]
     return out

@@ -28,14 +28,14 @@ from invrender.backend import dr
 from invrender.cluster import map_tasks
 from invrender.environments import find_environments, scale_environment
 from invrender.errors import InputError
-from invrender.lobes import fit_lobes, lobe_terms
+from invrender.lobes import lobe_terms, read_lobes
 from invrender.maps import Maps
 from invrender.materials import find_materials
 from invrender.render import Tables, Unbiased, material_from_maps, prepare, radiance
 from invrender.scene import make_scene, make_view
 from nets.clues import light_inputs, white_level
 from nets.draw import Options, draw_environment, draw_material, draw_rigs, light_pattern
-from nets.infer import estimate_of, linearised, lobe_input, predict
+from nets.infer import estimate_of, linearised, lobe_inputs, predict
 from nets.loader import positions
 from nets.noise import (
     capture_pattern,
@@ -93,10 +93,10 @@ def make_group(rng: np.random.Generator, options: Options) -> list[Sample]:
             packed = _pack(sample, unit, maps)
             if problems(packed):
                 continue
-            lobes = fit_lobes(photo, known_lights, options.samples, terms)
-            packed["lobes"] = lobe_input(lobes).astype(np.float16)
+            lobes = read_lobes(photo, known_lights, options.samples, terms)
+            packed |= {k: v.astype(np.float16) for k, v in lobe_inputs(lobes).items()}
             if options.network:
-                packed = _for_correction(packed, unit, known_lights, lobes, options)
+                packed = _for_correction(packed, unit, known_lights, lobes.maps, options)
             out.append(packed)
     return out
 

@@ -17,7 +17,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from invrender.errors import InputError
-from invrender.lobes import fit_lobes
+from invrender.lobes import Lobes, fit_lobes, read_lobes
 from invrender.maps import NAMES, Maps
 from invrender.materials import resize, resize_maps, unit_normals
 from invrender.prior import to_theta
@@ -53,7 +53,7 @@ class Estimate:
     maps: Maps
     sigma: dict[str, Array]
     unit: float
-    lobes: Maps | None = None
+    lobes: Lobes | None = None
     interrupted: bool = False
 
 
@@ -100,7 +100,7 @@ class Reconstructor:
             lobes = None
             if self.network.config.lobes:
                 seen = np.clip(np.nan_to_num(photo * scale, posinf=0.0, neginf=0.0), 0, 1e3)
-                lobes = fit_lobes(seen, prepared)
+                lobes = read_lobes(seen, prepared)
             kept = keep and _kept(keep, self.notes, photo, *lights.values())
             out = predict(self.network, batch_of(photo, lights, lobes), progress, kept)
             return replace(estimate_of(out, unit), lobes=lobes)
@@ -137,7 +137,8 @@ class Corrector:
             small, start, few = _shrunk(WHOLE, photo, estimate, clipped)
             return _joined(estimate, self(small, prepared, start, few, samples, progress))
         try:
-            lobes = estimate.lobes or fit_lobes(photo, prepared, samples)
+            known = estimate.lobes
+            lobes = known.maps if known else fit_lobes(photo, prepared, samples)
             for i in range(PASSES):
                 found = self._step(photo, prepared, estimate, lobes, clipped, samples)
                 if max(photo.shape[:2]) > COARSE:
@@ -246,14 +247,20 @@ def linearised(
     return {**out, "lobes": lobe_input(lobes), "position": positions(height, width).numpy()}
 
 
-def batch_of(photo: Array, lights: dict[str, Array], lobes: Maps | None) -> Batch:
+def batch_of(photo: Array, lights: dict[str, Array], lobes: Lobes | None) -> Batch:
     """The first network's batch (`nets.model`) of one photo (H, W, 3) and `light_inputs`."""
     batch = {k: torch.from_numpy(v)[None] for k, v in lights.items()}
     batch["photo"] = torch.from_numpy(np.ascontiguousarray(photo.transpose(2, 0, 1)))[None]
     batch["position"] = positions(*photo.shape[:2])[None]
     if lobes is not None:
-        batch["lobes"] = torch.from_numpy(lobe_input(lobes))[None]
+        batch |= {k: torch.from_numpy(v)[None] for k, v in lobe_inputs(lobes).items()}
     return batch
+
+
+def lobe_inputs(lobes: Lobes) -> dict[str, Array]:
+    """What the first network is told of a fit: lobes (7, H, W), readings (16, H, W), costs."""
+    readings = np.ascontiguousarray(np.moveaxis(lobes.readings, -1, 0))
+    return {"lobes": lobe_input(lobes.maps), "readings": readings, "costs": lobes.costs}
 
 
 def lobe_input(lobes: Maps) -> Array:

@@ -16,7 +16,18 @@ from invrender.errors import InputError
 from nets.model import Batch
 
 GROUP = 8  # shards that are shuffled together
-PIXELS = ("photo", "ideal", "maps", "clipped", "theta", "sigma0", "image", "jacobian", "lobes")
+PIXELS = (
+    "photo",
+    "ideal",
+    "maps",
+    "clipped",
+    "theta",
+    "sigma0",
+    "image",
+    "jacobian",
+    "lobes",
+    "readings",
+)
 CPU = torch.device("cpu")
 
 

@@ -6,7 +6,7 @@ pass) → clue encoder; both bottlenecks → fusion → material decoder. A batc
     photo (B, 3, H, W) radiance; position (B, 2, H, W) in [-1, 1]², x right, y up; and the light as
     `nets.clues.light_inputs` gives it, each with a batch axis: env_clues, active_clues,
     slope_clues, sky, screen, ball, pattern, rig; and with ``lobes`` lobes (B, 7, H, W), albedos and
-    roughness as `invrender.lobes` finds them.
+    roughness as `invrender.lobes` finds them, readings (B, 16, H, W) and costs (B, 40).
 
 All of it may be in any unit of radiance: it is divided by that of a white plane first.
 """
@@ -39,6 +39,9 @@ CLUES = ("none", "mirrorball", "plane", "colored", "full")
 MAPS = ("normal", "diffuse", "roughness", "specular")
 LIGHTS = ("env_clues", "active_clues", "slope_clues", "sky", "screen", "ball", "pattern")
 MIN_SIGMA, MAX_SIGMA = 0.002, 1.0
+# What `invrender.lobes` tells of a photo, and its usual f0; training needs no more of it.
+READINGS, COSTS, USUAL_F0 = 16, 40, 0.04
+MIXED = 6  # weights of what the photo says of a dielectric and of metal, for three maps
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,9 @@ class Config:
 
     active: clues of the screen's light too, and the ratio of the photo to a white plane.
     slopes: how radiance depends on the slopes, and what that says of them (`nets.slopes`).
-    lobes: what all pixels of a material, fitted together, say of it (`invrender.lobes`).
+    lobes: what all pixels of a material, fitted together, say of it (`invrender.lobes`): as inputs,
+    and each of the network's material maps is a mean of its own and of what the photo says of a
+    dielectric and of bare metal, by weights that the network finds.
     clue_skips: the material decoder also gets the clue encoder's skips. narrow_fusion: halve the
     channels before the fusion blocks, not after. correction: not this network but the correction
     of its maps (`nets.correction`), which heeds sizes alone.
@@ -125,12 +130,18 @@ class Network(nn.Module):
             if config.clue_skips and clue
             else None
         )
-        self.material_decoder = Decoder(2 + 7 + 4, width, config.decoder)
+        self.costs = nn.Sequential(nn.Linear(COSTS, 64), nn.GELU(), nn.Linear(64, deep)) if (
+            config.lobes
+        ) else None  # fmt: skip
+        self.material_decoder = Decoder(
+            2 + 7 + 4 + (MIXED if config.lobes else 0), width, config.decoder
+        )
         # A fresh network predicts a plane of middling materials, in doubt.
         with torch.no_grad():
             self.material_decoder.ending.weight *= 0.1
             self.normal_decoder.ending.weight *= 0.1
             start = [0, 0, *[0.3] * 3, 0.5, *[0.1] * 3, -3, -1.5, -1.5, -2]
+            start += [-1] * (MIXED if config.lobes else 0)
             for decoder, values in ((self.normal_decoder, [0, 0]), (self.material_decoder, start)):
                 assert decoder.ending.bias is not None
                 decoder.ending.bias.copy_(torch.tensor(values))
@@ -170,6 +181,7 @@ class Network(nn.Module):
             )
         if self.config.lobes:
             inputs.append(2 * pad_to(batch["lobes"], self.multiple) - 0.5)
+            inputs.append(_scaled(pad_to(batch["readings"], self.multiple)))
 
         x, skips = self.encoder(_last(torch.cat(inputs, 1)))
         slope0 = self.normal_decoder(x, skips)
@@ -182,14 +194,31 @@ class Network(nn.Module):
                 skips = [
                     s + conv(k) for s, k, conv in zip(skips, clue_skips, self.skips, strict=True)
                 ]
-        y = self.material_decoder(self.fusion(x), skips)
+        x = self.fusion(x)
+        if self.costs is not None:
+            x = x + self.costs(batch["costs"])[..., None, None]
+        y = self.material_decoder(x, skips)
         y, normal0 = y[..., :height, :width], normal0[..., :height, :width]
         slope = slope0[..., :height, :width] + y[:, :2]
         diffuse, roughness, specular = y[:, 2:5], y[:, 5:6], y[:, 6:9]
+        if self.config.lobes:
+            readings = batch["readings"]
+            nought = torch.zeros_like(diffuse)
+            cases = [
+                (diffuse, readings[:, :3], nought),
+                (roughness, readings[:, 3:4], readings[:, 7:8]),
+                (specular, nought + USUAL_F0, readings[:, 13:16]),
+            ]
+            diffuse, roughness, specular = (
+                _mean(own, dielectric, metal, logits)
+                for (own, dielectric, metal), logits in zip(
+                    cases, y[:, 13:].split(2, 1), strict=True
+                )
+            )
         if not self.training:
             diffuse, specular = diffuse.clamp(0, 1), specular.clamp(0, 1)
             roughness = roughness.clamp(0.02, 1)
-        sigma = torch.exp(y[:, 9:].clamp(-6.2, 0)) * self.calibration[:, None, None]
+        sigma = torch.exp(y[:, 9:13].clamp(-6.2, 0)) * self.calibration[:, None, None]
         out |= {"normal0": normal0, "normal": slope_normal(slope), "diffuse": diffuse}
         out |= {"roughness": roughness, "specular": specular}
         out["sigma"] = sigma.clamp(MIN_SIGMA, MAX_SIGMA)
@@ -214,6 +243,18 @@ class Network(nn.Module):
         return torch.cat(clues, 1)
 
 
+def _scaled(readings: Tensor) -> Tensor:
+    """Readings as inputs: shares to [-0.5, 1.5], odds halved."""
+    odds = torch.arange(readings.shape[1], device=readings.device).sub(9).abs() < 2
+    return torch.where(odds[:, None, None], readings / 2, 2 * readings - 0.5)
+
+
+def _mean(own: Tensor, dielectric: Tensor, metal: Tensor, logits: Tensor) -> Tensor:
+    """The mean of three by the softmax of (0, logits (B, 2, H, W))."""
+    a, b, c = F.pad(logits, (0, 0, 0, 0, 1, 0)).softmax(1).split(1, 1)
+    return a * own + b * dielectric + c * metal
+
+
 def _knows_environment(config: Config) -> bool:
     return config.clues not in ("none", "mirrorball")
 
@@ -221,7 +262,7 @@ def _knows_environment(config: Config) -> bool:
 def _channels(config: Config) -> tuple[int, int]:
     """Input channels of the image encoder and of the clue encoder."""
     image = 8 + (12 if config.active else 0) + (SLOPE_FEATURES if config.slopes else 0)
-    image += 7 if config.lobes else 0
+    image += 7 + READINGS if config.lobes else 0
     lit = 6 if config.active else 0
     clue = {
         "none": 0, "mirrorball": 3, "plane": 12, "full": 16 + lit, "colored": 24 + lit,

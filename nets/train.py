@@ -32,6 +32,7 @@ from nets.model import CLUES, MAPS, Batch
 from nets.store import PRESETS, AnyNetwork, build, load_weights, save_weights
 
 EMA_DECAY = 0.999
+UNUSED = -4.0  # the weight's logarithm that a network takes up a new reading with
 
 
 def learning_rate(step: int, steps: int, peak: float, last: float = 1e-7, warm: int = 200) -> float:
@@ -135,12 +136,13 @@ class Trainer:
 
 
 def take_up(network: nn.Module, known: nn.Module) -> None:
-    """Give a network the weights of another one, which may lack its last inputs: these begin at
-    nought."""
-    state, own = known.state_dict(), network.state_dict()
-    for k, v in state.items():
-        if v.ndim == 4 and v.shape[1] < own[k].shape[1]:
-            state[k] = nn.functional.pad(v, (0, 0, 0, 0, 0, own[k].shape[1] - v.shape[1]))
+    """Give a network the weights of another one, which may lack its last inputs and outputs: these
+    begin at nought, but for the outputs' bias, which is `UNUSED`."""
+    state = network.state_dict()
+    for k, v in known.state_dict().items():
+        grown = torch.full_like(state[k], UNUSED if k.endswith("ending.bias") else 0.0)
+        grown[tuple(slice(n) for n in v.shape)] = v
+        state[k] = grown
     network.load_state_dict(state)
 
 

@@ -18,6 +18,7 @@ from nets import data, draw, sheet, train  # noqa: E402
 from nets.calibrate import calibrate  # noqa: E402
 from nets.loader import batches, positions, read_batch, shards  # noqa: E402
 from nets.loss import MAPS, SPREAD, compare, total_loss, truth  # noqa: E402
+from nets.model import COSTS, READINGS  # noqa: E402
 from nets.sheet import problems  # noqa: E402
 from nets.store import build, load_weights  # noqa: E402
 
@@ -47,6 +48,7 @@ def test_a_shard_holds_captures_in_units_of_white(folder):
         shard["lobes"].shape == (6, 7, 16, 16)
         and 0 <= shard["lobes"].min() <= shard["lobes"].max() <= 1
     )
+    assert shard["readings"].shape == (6, READINGS, 16, 16) and shard["costs"].shape == (6, COSTS)
     assert 0.01 < shard["photo"].astype(float).mean() < 1
 
 

@@ -15,11 +15,12 @@ from nets import clues, slopes, splitsum  # noqa: E402
 from nets.blocks import NAFBlock, pad_to  # noqa: E402
 from nets.infer import Reconstructor, _tiles, predict  # noqa: E402
 from nets.loader import positions  # noqa: E402
-from nets.model import CLUES, normalise  # noqa: E402
+from nets.model import CLUES, COSTS, READINGS, USUAL_F0, normalise  # noqa: E402
 from nets.store import build, load_weights, save_weights  # noqa: E402
 from nets.train import take_up  # noqa: E402
 
 RIG = Rig()
+UNITLESS = ("position", "rig", "lobes", "readings", "costs")
 torch.set_num_threads(1)  # small tensors: more only get in each other's way
 
 
@@ -35,7 +36,10 @@ def make_batch(lights, height, width, count=1, seed=0):
     photo = rng.random((count, 3, height, width), np.float32) * 0.3
     batch["photo"] = torch.from_numpy(photo)
     batch["position"] = positions(height, width)[None].repeat(count, 1, 1, 1)
-    batch["lobes"] = torch.from_numpy(rng.random((count, 7, height, width), np.float32))
+    for key, channels in (("lobes", 7), ("readings", READINGS)):
+        images = rng.random((count, channels, height, width), np.float32)
+        batch[key] = torch.from_numpy(images)
+    batch["costs"] = torch.from_numpy(rng.random((count, COSTS), np.float32))
     return batch
 
 
@@ -280,8 +284,8 @@ def test_exposure_does_not_matter(lights):
     """All radiance in another unit: the same maps."""
     network = shaken(build("tiny"))
     a = make_batch(lights, 8, 8)
-    b = {k: v if k in ("position", "rig", "lobes") else v * 1e3 for k, v in a.items()}
-    c = {k: v if k in ("position", "rig", "lobes") else v * 1e-4 for k, v in a.items()}
+    b = {k: v if k in UNITLESS else v * 1e3 for k, v in a.items()}
+    c = {k: v if k in UNITLESS else v * 1e-4 for k, v in a.items()}
     expected = network(a)
     for other in (network(b), network(c)):
         for k, v in expected.items():
@@ -327,12 +331,35 @@ def test_weights_come_back(lights, tmp_path):
 
 
 def test_a_network_grows_by_inputs_that_begin_at_nought(lights):
+    """And by outputs that hardly count: what the photo says of dielectric and metal."""
     known, grown = shaken(build("tiny", lobes=False)), shaken(build("tiny"), seed=1)
+    costs = [p for k, p in grown.named_parameters() if k.startswith("costs")]
     take_up(grown, known)
+    with torch.no_grad():
+        costs[-2].zero_(), costs[-1].zero_()
     batch = make_batch(lights, 8, 8)
     torch.testing.assert_close(grown(batch)["sigma"], known(batch)["sigma"])
     weight = grown.encoder.intro.weight
-    assert not weight[:, -7:].any() and weight[:, :-7].all()
+    assert not weight[:, -7 - READINGS :].any() and weight[:, : -7 - READINGS].all()
+    off = grown(batch)["specular"] - known(batch)["specular"]
+    assert 0 < off.abs().max() < 0.04
+
+
+@pytest.mark.parametrize("metal", [False, True])
+def test_material_maps_are_the_photos_readings_where_trusted(lights, metal):
+    """With all weight on one case, the maps are those of the dielectric, or of bare metal."""
+    network = shaken(build("tiny"))
+    ending = network.material_decoder.ending
+    with torch.no_grad():
+        ending.weight[13:] = 0
+        ending.bias[13:] = torch.tensor([-40.0, 40.0] if metal else [40.0, -40.0]).repeat(3)
+    batch = make_batch(lights, 8, 8)
+    out, readings = network(batch), batch["readings"]
+    nought = torch.zeros(1, 3, 8, 8)
+    torch.testing.assert_close(out["diffuse"], nought if metal else readings[:, :3])
+    torch.testing.assert_close(out["specular"], readings[:, 13:] if metal else nought + USUAL_F0)
+    rough = readings[:, 7:8] if metal else readings[:, 3:4]
+    torch.testing.assert_close(out["roughness"], rough.clamp(min=0.02))
 
 
 @pytest.mark.parametrize("content", [b"", b"nothing of the kind", None])
@@ -374,11 +401,11 @@ def test_lobes_are_those_of_the_photo_in_any_unit(reconstructor):
     env = scale_environment(procedural_environment(5, 32), 0.5)
     maps = constant_maps(24, 24, diffuse=0.3, roughness=0.3, specular=0.04)
     photo = radiance_of(make_scene(RIG, block_pattern(64), env, 1.0), maps)
-    found = reconstructor(photo, RIG, block_pattern(64), 1.0, env).lobes
+    found = reconstructor(photo, RIG, block_pattern(64), 1.0, env).lobes.maps
     assert np.abs(found.diffuse - 0.3).mean() < 0.03
     assert np.abs(found.roughness - 0.3).mean() < 0.1
     for k in (1e-9, 1e9):
-        again = reconstructor(photo * k, RIG, block_pattern(64), k, env * k).lobes
+        again = reconstructor(photo * k, RIG, block_pattern(64), k, env * k).lobes.maps
         np.testing.assert_allclose(again.roughness, found.roughness)
         np.testing.assert_allclose(again.diffuse, found.diffuse, atol=1e-3)
 

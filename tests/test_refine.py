@@ -9,7 +9,7 @@ from invrender import refine as refinement
 from invrender.environments import procedural_environment, scale_environment
 from invrender.initial import baked_light, flat_maps
 from invrender.joint import find_turn, turned_environment, turned_rig
-from invrender.lobes import fit_lobes
+from invrender.lobes import fit_lobes, read_lobes
 from invrender.maps import constant_maps, map_errors
 from invrender.materials import procedural_material, turn_maps
 from invrender.pattern import block_pattern
@@ -84,6 +84,28 @@ def test_lobe_of_a_uniform_sample_is_found(prepared, environment, k_d, k_s, rho)
     assert error["roughness"] < 0.02
     assert error["specular"] < 0.02
     assert error["diffuse"] < 0.02
+
+
+@pytest.mark.parametrize("metal", [False, True])
+def test_readings_of_dielectric_and_metal(prepared, environment, metal):
+    """Of a textured sample: all three odds name its kind, whose readings are the truth."""
+    rng = np.random.default_rng(0)
+    truth = constant_maps(SIZE, SIZE, 0.3, 0.04, 0.32)
+    if metal:
+        truth = constant_maps(SIZE, SIZE, 0, (0.9, 0.7, 0.4), 0.32)
+    texture = rng.uniform(0.9, 1.1, (SIZE, SIZE, 1)).astype(np.float32)
+    truth.diffuse, truth.specular = truth.diffuse * texture, truth.specular * texture**metal
+    lobes = read_lobes(photo_of(truth, environment), prepared)
+    readings = lobes.readings
+    assert readings.shape == (SIZE, SIZE, 16) and lobes.costs.shape == (40,)
+    assert ((readings[..., 8:11] > 0) == metal).all()
+    color, rho = (readings[..., 4:7], 7) if metal else (readings[..., :3], 3)
+    wanted = truth.specular if metal else truth.diffuse
+    assert np.abs(color - wanted).mean() < 0.02
+    assert np.abs(readings[..., [rho, 12 if metal else 11]] - 0.32).max() < 0.08
+    assert np.abs(readings[..., 13:] - truth.specular).mean() < 0.05 or not metal
+    costs = lobes.costs.reshape(2, 2, -1)
+    assert (costs[:, int(metal)].min(-1) == 0).all() and (costs >= 0).all()
 
 
 def test_white_under_lights_told_too_dark_is_no_metal(prepared, environment):
