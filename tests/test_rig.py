@@ -63,6 +63,19 @@ def test_sample_points_have_row_0_at_plus_y():
     assert points[..., 0].max() == pytest.approx(0.09 / 2 * 0.75)
 
 
+def test_the_screens_cosines_make_its_form_factor():
+    """Of a rectangle parallel to a surface and above it: Howell's catalogue of configuration
+    factors, B-3, four corners; and nought above it."""
+    rig = Rig()
+    middle = rig.screen_corner + sum(rig.screen_edges) / 2
+    a = rig.screen_size / 2 / middle[2]
+    corner = 2 * a / math.sqrt(1 + a * a) * math.atan(a / math.sqrt(1 + a * a)) / (2 * math.pi)
+    cosines = rig.screen_cosines(middle * [[1, 1, 0], [1, 1, 2]], 200)
+    assert cosines.shape == (2, 200, 200)
+    assert cosines[0].sum() / math.pi == pytest.approx(4 * corner, rel=1e-4)
+    assert not cosines[1].any()
+
+
 def test_scale_does_not_matter():
     small, large = Rig(), Rig(180.0, 153.0, 17.0, 9.5)
     points = small.sample_points(5, 5)

@@ -52,6 +52,18 @@ def test_the_slopes_are_those_of_the_cost(hard):
     np.testing.assert_allclose(downhill, slope, atol=0.03 * np.abs(slope).max())
 
 
+def test_the_fits_screen_is_the_rigs(hard):
+    fit = screen._Fit(Photo(hard), RIG, BALL, blocks())
+    several = np.stack([unknowns(fit, k) for k in range(3)])
+    for u, *found in zip(several, *fit.screen(several), strict=True):
+        rig = fit.moved(u)
+        for got, wanted in zip(found, (*rig.screen_edges, rig.screen_corner), strict=True):
+            np.testing.assert_allclose(got, wanted, rtol=1e-12, atol=1e-15)
+    below = unknowns(fit, 0)
+    below[2] = -RIG.screen_height / (screen.SHIFT_PRIOR * RIG.sample_size)
+    assert fit.cost(below) == np.inf
+
+
 def test_lines_meet_the_screen_where_rays_do():
     fit = screen._Fit(Photo(np.ones((*SIZE, 3), np.float32)), RIG, BALL, blocks())
     u = np.zeros(13)
