@@ -61,8 +61,9 @@ class Lobe:
     def mirror(self, photo: Array, terms: Any) -> Array:
         """f0 (H, W, 3) of metal, pixel by pixel; the material's where it mirrors little."""
         _, b, a = terms
-        usual = LITTLE * b.mean((0, 1))
-        return np.clip((photo - a + usual * self.f0) / (b + usual + 1e-20), 0, 1)
+        usual = np.float32(LITTLE) * b.mean((0, 1))
+        f0 = np.float32(self.f0)
+        return np.clip((photo - a + usual * f0) / (b + usual + np.float32(1e-20)), 0, 1)
 
     def misfit(self, photo: Array, terms: Any, weight: Array) -> Array:
         """Squared residual (H, W) of the photo if all of it were this material."""
@@ -159,17 +160,17 @@ def _readings(
 ) -> Array:  # fmt: skip
     """`Lobes.readings`: labels, and the ``sample``, as ``either`` case; costs by ``texture``."""
     dielectric, metal = zip(*(e.lobes for e in either), strict=True)
-    rho = [ROUGHNESS[[f.rho for f in lobes]][label] for lobes in (dielectric, metal)]
     weight = np.exp((texture.min(1, keepdims=True) - texture) / 2)
     odds = _squashed(np.array([sample.odds, texture[0].min() - texture[1].min()]))
-    of_all = [np.full(label.shape, x) for x in (*odds, *(weight @ ROUGHNESS / weight.sum(1)))]
-    parts = [
-        _select(label, [f.diffuse(photo, terms[f.rho]) for f in dielectric]), rho[0],
-        _select(label, [f.mirror(photo, terms[f.rho]) for f in metal]), rho[1],
-        _squashed(np.array([e.odds for e in either]))[label], *of_all,
-        np.array([f.f0 for f in metal])[label],
-    ]  # fmt: skip
-    return np.dstack(parts).astype(np.float32)
+    out = np.empty((*label.shape, 16), np.float32)
+    out[..., :3] = _select(label, [f.diffuse(photo, terms[f.rho]) for f in dielectric])
+    out[..., 3] = ROUGHNESS[[f.rho for f in dielectric]][label]
+    out[..., 4:7] = _select(label, [f.mirror(photo, terms[f.rho]) for f in metal])
+    out[..., 7] = ROUGHNESS[[f.rho for f in metal]][label]
+    out[..., 8] = _squashed(np.array([e.odds for e in either]))[label]
+    out[..., 9:11], out[..., 11:13] = odds, weight @ ROUGHNESS / weight.sum(1)
+    out[..., 13:] = np.array([f.f0 for f in metal])[label]
+    return out
 
 
 def _squashed(odds: Array) -> Array:
