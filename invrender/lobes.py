@@ -130,7 +130,6 @@ def read_lobes(
         label = _closest(small, [terms[f.rho] for f in lobes], lobes)
         label = np.unique(label, return_inverse=True)[1].reshape(h, w)
     lobes = [_fit(moments, label == k, whole) for k in range(int(label.max()) + 1)]
-
     either = [_either(moments, label == k) for k in range(len(lobes))]
 
     # At full size each pixel chooses among the lobes anew.
