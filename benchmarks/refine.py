@@ -175,7 +175,7 @@ def main() -> None:
 
     results: dict[str, list[dict[str, Any]]] = {}
     inits = args.init or INITS
-    measure(folders[0], size, inits[0])  # libraries load and kernels compile before the clock starts
+    measure(folders[0], size, inits[0])  # loads libraries, compiles kernels
     for init in inits:
         rows = results[init] = []
         for folder in folders:
