@@ -99,7 +99,9 @@ def lobe_terms(
 
 def fit_lobes(photo: Array, prepared: Tables | Unbiased, samples: int = 64) -> Maps:
     """Maps of a flat sample with up to `MATERIALS` lobes for a photo (H, W, 3), linear radiance."""
-    return read_lobes(photo, prepared, samples).maps
+    terms = lobe_terms(prepared, photo.shape[0], photo.shape[1], samples)
+    lobes = _search(_small(photo), terms)[2]
+    return _maps(photo, lobes, _full_terms(photo, prepared, samples, terms, lobes))[0]
 
 
 def read_lobes(
@@ -112,45 +114,67 @@ def read_lobes(
 
     terms: `lobe_terms` of these lights, where several photos are taken under them.
     """
-    height, width = photo.shape[:2]
-    h, w = min(FIT_SIZE, height), min(FIT_SIZE, width)
-    rows, columns = _centres(h, height), _centres(w, width)
-    small = photo[np.ix_(rows, columns)]
-    terms = terms or lobe_terms(prepared, height, width, samples)
+    terms = terms or lobe_terms(prepared, photo.shape[0], photo.shape[1], samples)
+    small = _small(photo)
+    moments, label, lobes = _search(small, terms)
+    either = [_either(moments, label == k) for k in range(len(lobes))]
+    every = [*lobes, *(f for e in either for f in e.lobes)]
+    full = _full_terms(photo, prepared, samples, terms, every)
+    maps, label = _maps(photo, lobes, full)
+    sample, texture = _either(moments, np.ones(small.shape[:2], bool)), _by_texture(small, terms)
+    costs = np.stack([c - c.min() for c in (sample.costs, texture)])
+    readings = _readings(photo, full, label, either, sample, texture)
+    return Lobes(maps, readings, _squashed(costs).ravel().astype(np.float32))
 
+
+def _small(photo: Array) -> Array:
+    """The pixels of a photo that its lobes are fitted to."""
+    rows, columns = (_centres(min(FIT_SIZE, n), n) for n in photo.shape[:2])
+    return photo[np.ix_(rows, columns)]
+
+
+def _search(photo: Array, terms: list[list[Array]]) -> tuple[Array, Labels, list[Lobe]]:
+    """The moments of a photo's pixels, the group of each (h, w), and each group's lobe."""
+    h, w = photo.shape[:2]
     rho = int(np.abs(ROUGHNESS - USUAL_ROUGHNESS).argmin())
     usual = Lobe(rho, np.full(3, USUAL_SPECULAR), np.ones(3))
-    moments = _moments(small, terms)
+    moments = _moments(photo, terms)
     whole = _fit(moments, np.ones((h, w), bool), usual)
     # Groups of like albedo first; then each pixel joins the material that explains it best, with
     # its neighbours.
-    label = _group(whole.diffuse(small, terms[whole.rho]))
+    label = _group(whole.diffuse(photo, terms[whole.rho]))
     for _ in range(ROUNDS):
         lobes = [_fit(moments, label == k, whole) for k in range(int(label.max()) + 1)]
-        label = _closest(small, [terms[f.rho] for f in lobes], lobes)
+        label = _closest(photo, [terms[f.rho] for f in lobes], lobes)
         label = np.unique(label, return_inverse=True)[1].reshape(h, w)
-    lobes = [_fit(moments, label == k, whole) for k in range(int(label.max()) + 1)]
-    either = [_either(moments, label == k) for k in range(len(lobes))]
+    return moments, label, [_fit(moments, label == k, whole) for k in range(int(label.max()) + 1)]
 
-    # At full size each pixel chooses among the lobes anew.
-    full = {
-        rho: terms[rho] if (h, w) == (height, width)
+
+def _full_terms(
+    photo: Array, prepared: Tables | Unbiased, samples: int, terms: list[list[Array]],
+    lobes: list[Lobe],
+) -> dict[int, list[Array]]:  # fmt: skip
+    """E, B and A of all of a photo's pixels, by the lobes' ρ."""
+    height, width = photo.shape[:2]
+    return {
+        rho: terms[rho] if terms[rho][0].shape == photo.shape
         else _terms(prepared, height, width, float(ROUGHNESS[rho]), samples)
-        for rho in {f.rho for f in lobes} | {f.rho for e in either for f in e.lobes}
+        for rho in {f.rho for f in lobes}
     }  # fmt: skip
-    label = _closest(photo, [full[f.rho] for f in lobes], lobes)
-    normal = np.zeros((height, width, 3), np.float32)
+
+
+def _maps(photo: Array, lobes: list[Lobe], terms: dict[int, list[Array]]) -> tuple[Maps, Labels]:
+    """Each pixel chooses among the lobes anew: the maps, and which lobe it has (H, W)."""
+    label = _closest(photo, [terms[f.rho] for f in lobes], lobes)
+    normal = np.zeros(photo.shape, np.float32)
     normal[..., 2] = 1
     maps = Maps(
-        _select(label, [f.diffuse(photo, full[f.rho]) for f in lobes]),
+        _select(label, [f.diffuse(photo, terms[f.rho]) for f in lobes]),
         np.array([f.f0 for f in lobes], np.float32)[label],
         ROUGHNESS[[f.rho for f in lobes]].astype(np.float32)[label],
         normal,
     )
-    sample, texture = _either(moments, np.ones((h, w), bool)), _by_texture(small, terms)
-    costs = np.stack([c - c.min() for c in (sample.costs, texture)])
-    readings = _readings(photo, full, label, either, sample, texture)
-    return Lobes(maps, readings, _squashed(costs).ravel().astype(np.float32))
+    return maps, label
 
 
 def _readings(
@@ -229,16 +253,24 @@ def _moments(photo: Array, terms: list[Any]) -> Array:
     return out
 
 
-def _fit(moments: Array, of: NDArray[np.bool_], usual: Lobe) -> Lobe:
-    """The lobe of the pixels ``of``: as usual, of another f0, or bare metal."""
+def _fits(
+    moments: Array, of: NDArray[np.bool_], usual: Array, spreads: tuple[float, ...]
+) -> tuple[Array, Array, Array]:
+    """f0, albedo (case, ρ, 3) and -2 log-likelihood (case, ρ) of the pixels ``of``: with f0 within
+    each of the spreads around the usual one, and as bare metal."""
     measurements = MEASUREMENTS * float(of.mean())
     mean = np.moveaxis(moments @ (of.ravel() / of.sum()), -1, 0)  # (6, ρ, 3)
-    variance = _least_squares(mean, 0.0, usual.f0)[2]
+    variance = _least_squares(mean, 0.0, usual)[2]
     metal = mean * np.array([0, 0, 1, 0, 1, 1])[:, None, None]
-    fits = [_least_squares(mean, variance / measurements / s**2, usual.f0) for s in SPREAD_F0]
-    fits.append(_least_squares(metal, 0.0, usual.f0))
+    fits = [_least_squares(mean, variance / measurements / s**2, usual) for s in spreads]
+    fits.append(_least_squares(metal, 0.0, usual))
     f0, albedo, residual = (np.stack(x) for x in zip(*fits, strict=True))
-    cost = measurements * np.log(residual.mean(-1) + 1e-9)
+    return f0, albedo, measurements * np.log(residual.mean(-1) + 1e-9)
+
+
+def _fit(moments: Array, of: NDArray[np.bool_], usual: Lobe) -> Lobe:
+    """The lobe of the pixels ``of``: as usual, of another f0, or bare metal."""
+    f0, albedo, cost = _fits(moments, of, usual.f0, SPREAD_F0)
     cost += ((ROUGHNESS - ROUGHNESS[usual.rho]) / SPREAD) ** 2
     cost[1:] += UNUSUAL
     cost[2, f0[2].mean(-1) < METAL] = np.inf
@@ -261,16 +293,8 @@ class _Either:
 
 def _either(moments: Array, of: NDArray[np.bool_]) -> _Either:
     """The pixels ``of`` in either case."""
-    measurements, usual = MEASUREMENTS * float(of.mean()), np.full(3, USUAL_SPECULAR)
-    mean = np.moveaxis(moments @ (of.ravel() / of.sum()), -1, 0)
-    pull = _least_squares(mean, 0.0, usual)[2] / measurements / SPREAD_F0[0] ** 2
-    metal = mean * np.array([0, 0, 1, 0, 1, 1])[:, None, None]
-    f0, _, residual = (
-        np.stack(x)
-        for x in zip(*(_least_squares(m, p, usual) for m, p in ((mean, pull), (metal, 0.0))),
-                     strict=True)
-    )  # fmt: skip
-    costs = measurements * np.log(residual.mean(-1) + 1e-9) + _UNLIKELY
+    f0, _, costs = _fits(moments, of, np.full(3, USUAL_SPECULAR), SPREAD_F0[:1])
+    costs += _UNLIKELY
     i, j = (int(k) for k in costs.argmin(1))
     return _Either((Lobe(i, f0[0, i], np.ones(3)), Lobe(j, f0[1, j], np.zeros(3))), costs)
 
