@@ -27,15 +27,16 @@ from common import bar, markdown, write_results
 from photos import Shot, arguments, make_shot
 from scipy.spatial.transform import Rotation
 
-from invrender.ball import find_ball
-from invrender.capture import Capture, extract_lights
-from invrender.environments import resample_environment
-from invrender.errors import InputError
-from invrender.mirror import make_ball
+from invrender.capture.ball import find_ball
+from invrender.capture.camera import corners
+from invrender.capture.lights import extract_lights
+from invrender.capture.mirror import make_ball
+from invrender.capture.orientation import find_upright_ball, posed
+from invrender.capture.table import room_irradiance
+from invrender.files.capture import Capture
 from invrender.rig import Rig
-from invrender.square import corners
-from invrender.unfold import room_irradiance
-from invrender.upright import find_upright_ball, posed
+from invrender.sphere import resample_environment
+from invrender.types import InputError
 
 SEED = 3000  # photos from here on serve for nothing else
 SURE = 0.9  # confidence from which a wrong ball counts

@@ -3,8 +3,8 @@
 `python benchmarks/clipped.py [--quick] --out DIR [--rooms DIR]`. Photos as in `photos.py`; ball,
 screen's pose and light as they are, so that nothing else errs; only photos with clipped lamps
 count. Error: mean over nine normals, relative. The lamps' excess in the rooms themselves, printed
-first, is to compare the prior in `invrender.clipped` with. The formula of the paper's code has no
-scale of its own: it is given that of the truth on the plane.
+first, is to compare the prior in `invrender.capture.clipped_lamps` with. The formula of the
+paper's code has no scale of its own: it is given that of the truth on the plane.
 """
 
 from __future__ import annotations
@@ -19,16 +19,11 @@ from photos import Shot, arguments, make_shot
 from refine_captures import HOLDOUT
 from scipy import ndimage
 
-from invrender.clipped import clipped_share, raise_clipped
-from invrender.environments import (
-    find_environments,
-    irradiance,
-    procedural_environment,
-    read_environment,
-    resample_environment,
-)
-from invrender.mirror import make_ball
-from invrender.unfold import fill_environment, unfold_environment
+from invrender.capture.clipped_lamps import clipped_share, raise_clipped
+from invrender.capture.environment import fill_environment, unfold_environment
+from invrender.capture.mirror import make_ball
+from invrender.data.environments import find_environments, procedural_environment, read_environment
+from invrender.sphere import irradiance, resample_environment
 
 Array = NDArray[np.floating[Any]]
 SEED = 3000  # photos from here on

@@ -15,8 +15,8 @@ from typing import Any
 
 from common import bar, machine, markdown, write_results
 
-from invrender.backend import dr
-from nets import data
+from invrender.render.backend import dr
+from nets.training import dataset as data
 
 WARM = 16  # captures before the clock starts: kernels of a first run are compiled once a machine
 BARS = {128: 8.0, 256: 2.0}  # captures a second on two cores

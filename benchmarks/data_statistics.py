@@ -25,26 +25,24 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import ks_2samp
 
-from invrender.environments import (
+from invrender.data.environments import (
     KINDS,
     find_environments,
-    irradiance,
     procedural_environment,
     read_environment,
-    solid_angles,
 )
-from invrender.errors import InputError
-from invrender.images import write_png
-from invrender.maps import Maps
-from invrender.materials import (
+from invrender.data.materials import (
     PRESETS,
     augment,
     check_maps,
     is_directx,
     load_materials,
     procedural_material,
-    resize_maps,
 )
+from invrender.files.images import write_png
+from invrender.maps import Maps, resize_maps
+from invrender.sphere import irradiance, solid_angles
+from invrender.types import InputError
 
 Array = NDArray[np.floating[Any]]
 Table = dict[str, Array]

@@ -25,7 +25,7 @@ from common import bar, machine, markdown, timed, write_results
 from forward_gradients import forward_backward, measure_gradients
 from scenes import GAIN, RIG, SCENES, Array, Case, averaged, curve, time_to
 
-from invrender.backend import dr
+from invrender.render.backend import dr
 
 
 def measure_values(case: Case, quick: bool) -> dict[str, Any]:

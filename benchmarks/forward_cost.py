@@ -28,10 +28,10 @@ import numpy as np
 from common import bar, machine, markdown, write_results
 from scenes import GAIN, RIG, SCENES, Array, Case, averaged, make_environment, make_maps
 
-from invrender import render
-from invrender.backend import Float, UInt, dr
 from invrender.maps import Maps
-from invrender.scene import make_scene, make_view
+from invrender.render import renderer as render
+from invrender.render.backend import Float, UInt, dr
+from invrender.render.scene import make_scene, make_view
 
 LIMIT = 4.0  # GB that a 4096² render may take
 

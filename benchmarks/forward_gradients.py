@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 from scenes import MAPS, RIG, Array, Case, averaged, curve
 
-from invrender import photograph, render
-from invrender.backend import Float, dr, vector
-from invrender.photograph import mi
+from invrender.render import path_traced as photograph
+from invrender.render import renderer as render
+from invrender.render.backend import Float, dr, vector
+from invrender.render.path_traced import mi
+from invrender.render.scene import make_view
 from invrender.rig import Rig
-from invrender.scene import make_view
 
 
 def sample_sensor(n: int, rig: Rig = RIG) -> mi.Sensor:

@@ -3,8 +3,8 @@
     python benchmarks/inference.py --out DIR [--quick] [--weights FILE ...] [--valid NAME=DIR ...]
 
 Seconds of one sample of 256 × 256 pixels, lights and clues included, median of several; each
-network's error on folders of `nets.data` (see docs/networks.md), without them and with --quick on a
-few small procedural captures. Presets without weights are timed alone.
+network's error on folders of `nets.training.dataset` (see docs/networks.md), without them and with
+--quick on a few small procedural captures. Presets without weights are timed alone.
 """
 
 from __future__ import annotations
@@ -18,14 +18,15 @@ import torch
 from common import markdown, timed, write_results
 from matplotlib import pyplot as plt
 
-from invrender.environments import procedural_environment
-from invrender.pattern import default_pattern
+from invrender.data.environments import procedural_environment
+from invrender.pattern.default import default_pattern
 from invrender.rig import Rig
-from nets.data import Options, write_shard
-from nets.infer import WEIGHTS, Reconstructor
 from nets.model import MAPS
+from nets.predict import WEIGHTS, Reconstructor
 from nets.store import PRESETS, build, save_weights
-from nets.train import baseline, validate
+from nets.training.dataset import write_shard
+from nets.training.draw import Options
+from nets.training.train import baseline, validate
 
 SIZE = 256
 

@@ -3,8 +3,8 @@
     python benchmarks/networks.py --out DIR [--quick] [--data DIR --valid NAME=DIR ...]
 
 Every variant sees the same captures in the same order, from the same seed. ``--data`` and
-``--valid`` are folders of `nets.data` (see docs/networks.md); without them, and with --quick, a few
-procedural captures are made first. Training goes on where an earlier run stopped.
+``--valid`` are folders of `nets.training.dataset` (see docs/networks.md); without them, and with
+--quick, a few procedural captures are made first. Training goes on where an earlier run stopped.
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ from typing import Any
 from common import bar, markdown, write_results
 from matplotlib import pyplot as plt
 
-from nets.data import Options, write_shard
 from nets.model import MAPS
-from nets.train import baseline, parser, train
+from nets.training.dataset import write_shard
+from nets.training.draw import Options
+from nets.training.train import baseline, parser, train
 
 VARIANTS = {
     "no clues (LPL+)": ("none", "off", "off", "off", "off"),

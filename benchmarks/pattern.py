@@ -22,7 +22,10 @@ from common import bar, markdown, write_results
 from matplotlib import pyplot as plt
 from numpy.typing import NDArray
 
-from invrender.design import (
+from invrender.colour import linear_to_srgb
+from invrender.files.images import read_image, write_exr
+from invrender.pattern.default import block_pattern, default_pattern
+from invrender.pattern.design import (
     CELLS,
     DARKEST,
     NAMES,
@@ -32,9 +35,8 @@ from invrender.design import (
     optimise,
     wheel,
 )
-from invrender.images import linear_to_srgb, read_image, write_exr
-from invrender.pattern import block_pattern, default_pattern, resize_pattern
 from invrender.rig import Rig
+from invrender.sampling import resize_pattern
 
 Array = NDArray[np.floating[Any]]
 TRAIN, HELD_OUT = 101, 102  # populations; the shipped pattern comes from 1 and 2
@@ -93,7 +95,7 @@ def networks(args: argparse.Namespace, patterns: dict[str, Array]) -> dict[str, 
         root.mkdir(parents=True, exist_ok=True)
         file = root / "pattern.exr"
         write_exr(file, resize_pattern(pattern, 256))
-        data = ["-m", "nets.data", "--size", 96, "--pattern", file, *folders]
+        data = ["-m", "nets.training.dataset", "--size", 96, "--pattern", file, *folders]
         python(*data, "--out", root / "train", "--count", args.captures)
         python(
             *data, "--out", root / "valid", "--count", 128, "--first", 9000,
@@ -102,7 +104,8 @@ def networks(args: argparse.Namespace, patterns: dict[str, Array]) -> dict[str, 
         for seed in range(args.seeds):
             out = root / f"seed{seed}"
             python(
-                "-m", "nets.train", "--data", root / "train", "--valid", f"v={root / 'valid'}",
+                "-m", "nets.training.train", "--data", root / "train",
+                "--valid", f"v={root / 'valid'}",
                 "--out", out, "--steps", args.steps, "--every", args.steps // 4, "--crop", 64,
                 "--seed", seed,
             )  # fmt: skip

@@ -19,21 +19,16 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
 
-from invrender.environments import (
-    find_environments,
-    procedural_environment,
-    read_environment,
-    resample_environment,
-    rotate_environment,
-    scale_environment,
-)
-from invrender.images import Photo, linear_to_srgb, srgb_to_linear
-from invrender.maps import Maps
-from invrender.materials import procedural_material, resize_maps
-from invrender.pattern import default_pattern
-from invrender.render import render
+from invrender.capture.table import room_irradiance
+from invrender.colour import linear_to_srgb, srgb_to_linear
+from invrender.data.environments import find_environments, procedural_environment, read_environment
+from invrender.data.materials import procedural_material
+from invrender.files.images import Photo
+from invrender.maps import Maps, resize_maps
+from invrender.pattern.default import default_pattern
+from invrender.render.renderer import render
 from invrender.rig import Rig
-from invrender.unfold import room_irradiance
+from invrender.sphere import resample_environment, rotate_environment, scale_environment
 
 Array = NDArray[np.floating[Any]]
 Rng = np.random.Generator

@@ -18,13 +18,14 @@ from typing import Any
 import numpy as np
 from common import bar, markdown, write_results
 
-from invrender.ball import find_ball
-from invrender.capture import MIN_PHOTO, Capture, extract_lights
-from invrender.errors import InputError
-from invrender.images import Photo, read_photo
-from invrender.pattern import default_pattern
+from invrender.capture.ball import find_ball
+from invrender.capture.lights import extract_lights
+from invrender.capture.orientation import find_upright_ball
+from invrender.files.capture import MIN_PHOTO, Capture
+from invrender.files.images import Photo, read_photo
+from invrender.pattern.default import default_pattern
 from invrender.rig import Rig
-from invrender.upright import find_upright_ball
+from invrender.types import InputError
 
 WIDTH = 800  # pixels to which larger photos are averaged, about
 FOV = 20.0  # degrees, of the rig that looks for the photo's own ball

@@ -20,13 +20,13 @@ from common import bar, markdown, write_results
 from matplotlib import pyplot as plt
 from refine_captures import arguments, make_captures, true_lights
 
-from invrender.capture import crop_mask, crop_sample
-from invrender.maps import NAMES, Maps, map_errors
-from invrender.materials import resize_maps
-from invrender.pipeline import POOR_FIT, Seen, Stages, coarse_error, recover, see
-from invrender.relight import rerender
-from invrender.render import picture
-from invrender.results import deviations
+from invrender.capture.crop import crop_mask, crop_sample
+from invrender.maps import NAMES, Maps, map_errors, resize_maps
+from invrender.pipeline import POOR_FIT, Seen, Stages, recover, see
+from invrender.refine.checks import coarse_error
+from invrender.render.point_lights import rerender
+from invrender.render.renderer import picture
+from invrender.report.results import deviations
 
 TRUE = "network, true lights"
 INITS = ("network", "flat", TRUE)

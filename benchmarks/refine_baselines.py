@@ -30,16 +30,18 @@ from matplotlib import pyplot as plt
 from scipy.optimize import minimize
 from torch_forward import TorchScene
 
-from invrender import brdf  # noqa: F401  (Dr.Jit's back end before Mitsuba)
-from invrender.backend import dr
-from invrender.maps import Maps, map_errors
-from invrender.materials import resize_maps
-from invrender.photograph import mi, sample_scene
+from invrender.maps import Maps, map_errors, resize_maps
 from invrender.pipeline import Seen, Stages, see
-from invrender.prior import Prior, network_prior, project, to_maps, to_theta
-from invrender.refine import PHOTO_NOISE, SHARE, Shot, correct, linearise, refine
+from invrender.refine.cautious import SHARE, correct
+from invrender.refine.gauss_newton import PHOTO_NOISE, Shot, linearise, refine
+from invrender.refine.priors import Prior, network_prior
+from invrender.refine.theta import project, to_maps, to_theta
+from invrender.render import brdf  # noqa: F401  (Dr.Jit's back end before Mitsuba)
+from invrender.render.backend import dr
+from invrender.render.path_traced import mi, sample_scene
+from nets.batch import batch_of
 from nets.clues import light_inputs
-from nets.infer import Corrector, Reconstructor, batch_of
+from nets.predict import Corrector, Reconstructor
 
 Array = Any
 Gradient = Callable[[Array, int], tuple[float, Array]]

@@ -5,8 +5,8 @@
 Refines captures like those of `refine.py`, but none of its materials and rooms, from the photo
 alone: real ones that the networks have seen, and half as many procedural ones that they have not.
 For each map, the factor on its sigma with which 68% of the truth lies within, of all pixels and
-captures of a kind together, and the mean over both kinds: what `invrender.prior.UNTOLD` is to be
-multiplied by, again until it is one.
+captures of a kind together, and the mean over both kinds: what `invrender.refine.priors.UNTOLD` is
+to be multiplied by, again until it is one.
 """
 
 from __future__ import annotations
@@ -19,10 +19,9 @@ from common import markdown, write_results
 from numpy.typing import NDArray
 from refine_captures import arguments, make_captures
 
-from invrender.maps import NAMES
-from invrender.materials import resize_maps
+from invrender.maps import NAMES, resize_maps
 from invrender.pipeline import Stages, recover, see
-from invrender.results import deviations
+from invrender.report.results import deviations
 
 FIRST_SEEDS = {"real": 97_000, "made": 98_000}
 SURE = 0.6827  # of a Gaussian within one sigma

@@ -18,31 +18,22 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from invrender.capture import Capture, Lights
-from invrender.environments import (
-    find_environments,
-    procedural_environment,
-    read_environment,
-    rotate_environment,
-    scale_environment,
-)
-from invrender.images import linear_to_srgb, read_image, write_exr
-from invrender.maps import Maps
-from invrender.materials import (
-    crop_maps,
-    find_materials,
-    procedural_material,
-    read_material,
-    resize_maps,
-    turn_maps,
-)
-from invrender.pattern import default_pattern
+from invrender.capture.lights import Lights
+from invrender.colour import linear_to_srgb
+from invrender.data.environments import find_environments, procedural_environment, read_environment
+from invrender.data.materials import find_materials, procedural_material, read_material
+from invrender.data.simulate import simulate
+from invrender.files.capture import Capture
+from invrender.files.images import read_image, write_exr
+from invrender.files.rig_toml import read_rig
+from invrender.maps import Maps, crop_maps, resize_maps, turn_maps
+from invrender.pattern.default import default_pattern
 from invrender.pipeline import known_lights
-from invrender.rig import Rig, read_rig
-from invrender.simulate import simulate
+from invrender.rig import Rig
+from invrender.sphere import rotate_environment, scale_environment
 
 Array = NDArray[np.floating[Any]]
-HOLDOUT = Path(__file__).parents[1] / "nets" / "holdout.txt"
+HOLDOUT = Path(__file__).parents[1] / "nets" / "training" / "holdout.txt"
 FIRST_SEED = 90_000  # of procedural materials and rooms that nothing else uses
 GAIN = 2.0  # radiance of the screen's white
 SHIFT, TILT = 3e-3, 3.0  # standard deviations, metres and degrees, of the screen's pose

@@ -22,17 +22,22 @@ import numpy as np
 from common import markdown, write_results
 from numpy.typing import NDArray
 
-from invrender.environments import procedural_environment, scale_environment
-from invrender.initial import baked_light, flat_maps
-from invrender.lobes import fit_lobes
+from invrender.data.environments import procedural_environment
 from invrender.maps import Maps, constant_maps, map_errors
-from invrender.pattern import default_pattern
-from invrender.pipeline import BAKED, POOR_FIT, coarse_error, photo_error
-from invrender.prior import lobe_prior, network_prior, project, to_theta
-from invrender.refine import Shot, correct, refine
-from invrender.render import make_scene, picture, prepare
+from invrender.pattern.default import default_pattern
+from invrender.pipeline import BAKED, POOR_FIT
+from invrender.refine.cautious import correct
+from invrender.refine.checks import baked_light, coarse_error, photo_error
+from invrender.refine.flat import flat_maps
+from invrender.refine.gauss_newton import Shot, refine
+from invrender.refine.lobes import fit_lobes
+from invrender.refine.priors import lobe_prior, network_prior
+from invrender.refine.theta import project, to_theta
+from invrender.render.renderer import picture, prepare
+from invrender.render.scene import make_scene
 from invrender.rig import Rig
-from nets.infer import Corrector, Reconstructor
+from invrender.sphere import scale_environment
+from nets.predict import Corrector, Reconstructor
 
 Array = NDArray[np.floating[Any]]
 RIG, GAIN, PATTERN = Rig(), 2.0, default_pattern()

@@ -21,7 +21,7 @@ from refine import measure, pooled
 from refine_captures import arguments, make_capture, sample_and_room
 
 from invrender.maps import NAMES
-from invrender.pattern import default_pattern
+from invrender.pattern.default import default_pattern
 from invrender.rig import Rig
 
 FIRST_SEED = 95_000

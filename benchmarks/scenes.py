@@ -10,13 +10,14 @@ from common import timed
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from invrender import photograph, render
-from invrender.backend import dr
-from invrender.environments import procedural_environment
+from invrender.data.environments import procedural_environment
 from invrender.maps import Maps
+from invrender.render import path_traced as photograph
+from invrender.render import renderer as render
+from invrender.render.backend import dr
+from invrender.render.fast.tables import Tables
+from invrender.render.scene import make_scene, make_view
 from invrender.rig import Rig
-from invrender.scene import make_scene, make_view
-from invrender.tables import Tables
 
 Array = NDArray[Any]
 # The sample's pixels are whole pixels of a film 2.5 samples wide: δ = 3/32 l.

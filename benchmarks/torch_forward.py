@@ -1,7 +1,8 @@
 """The mis estimator's BSDF-and-light sampling in plain PyTorch: a baseline, not a tool.
 
 One sample each of the screen's area, of the environment's texels and of the visible normals a
-round, by the balance heuristic, as `invrender.mis` does it; whole-image tensors, no fused kernel.
+round, by the balance heuristic, as `invrender.render.mis` does it; whole-image tensors, no fused
+kernel.
 """
 
 from __future__ import annotations

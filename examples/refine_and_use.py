@@ -10,12 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from invrender.cli import EXAMPLE
+from invrender.cli.main import EXAMPLE
 from invrender.export import export
-from invrender.images import read_image, write_png
-from invrender.maps import NAMES, read_maps
+from invrender.files.images import read_image, write_png
+from invrender.files.maps import read_maps
+from invrender.maps import NAMES
 from invrender.pipeline import refine_capture
-from invrender.relight import relight
+from invrender.render.point_lights import relight
 from invrender.rig import Rig
 
 

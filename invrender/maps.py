@@ -3,16 +3,84 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
-from invrender.errors import InputError
-from invrender.images import read_image, write_exr
+from invrender.sampling import resize
+from invrender.types import Array, InputError
 
-Array = NDArray[np.floating[Any]]
+
+def unit_normals(normal: Array) -> Array:
+    """Unit vectors, none below the surface."""
+    normal = normal.copy()
+    normal[..., 2] = np.maximum(normal[..., 2], 1e-3)
+    return (normal / np.linalg.norm(normal, axis=-1, keepdims=True)).astype(np.float32)
+
+
+def resize_maps(maps: Maps, height: int, width: int) -> Maps:
+    """Resize by area averages; normals are averaged and made unit again."""
+    if maps.shape == (height, width):
+        return maps
+    return Maps(
+        resize(maps.diffuse, height, width),
+        resize(maps.specular, height, width),
+        resize(maps.roughness, height, width),
+        unit_normals(resize(maps.normal, height, width)),
+    )
+
+
+def crop_maps(maps: Maps, top: int, left: int, height: int, width: int) -> Maps:
+    """A rectangle of pixels, copied. Raises `InputError` when it does not lie inside."""
+    h, w = maps.shape
+    if min(top, left) < 0 or top + height > h or left + width > w or min(height, width) < 1:
+        raise InputError(f"a crop of {width} × {height} at ({left}, {top}) is not inside {w} × {h}")
+    at = slice(top, top + height), slice(left, left + width)
+    return Maps(*(m[at].copy() for m in (maps.diffuse, maps.specular, maps.roughness, maps.normal)))
+
+
+def turn_maps(maps: Maps, quarters: int = 0, mirror: bool = False) -> Maps:
+    """Turn counter-clockwise by quarters, after mirroring left to right; normals turn along."""
+    normal = maps.normal
+    images = [maps.diffuse, maps.specular, maps.roughness]
+    if mirror:
+        images = [i[:, ::-1] for i in images]
+        normal = normal[:, ::-1] * np.array([-1, 1, 1], np.float32)
+    images = [np.rot90(i, quarters) for i in images]
+    normal = np.rot90(normal, quarters)
+    for _ in range(quarters % 4):
+        normal = np.stack([-normal[..., 1], normal[..., 0], normal[..., 2]], -1)
+    d, s, r = (np.ascontiguousarray(i, np.float32) for i in images)
+    return Maps(d, s, r, np.ascontiguousarray(normal, np.float32))
+
+
+def rotate_maps(maps: Maps, angle: float, size: int) -> Maps:
+    """Turn counter-clockwise by any angle in radians and keep the central size × size pixels.
+
+    Raises `InputError` if the turned square does not fit inside the maps.
+    """
+    h, w = maps.shape
+    c, s = np.cos(angle), np.sin(angle)
+    if size < 1 or size * (abs(c) + abs(s)) > min(h, w) + 1e-6:
+        raise InputError(f"a square of {size} pixels does not fit into {w} × {h} turned so far")
+    x = np.arange(size) - (size - 1) / 2
+    px, py = np.meshgrid(x, -x)  # right and up, from the centre
+    columns = (w - 1) / 2 + c * px + s * py
+    rows = (h - 1) / 2 - (c * py - s * px)
+
+    def sample(image: Array) -> Array:
+        if image.ndim == 3:
+            return np.stack([sample(image[..., i]) for i in range(image.shape[2])], -1)
+        return map_coordinates(image, [rows, columns], order=1, mode="nearest").astype(np.float32)
+
+    n = sample(maps.normal)
+    n = np.stack([c * n[..., 0] - s * n[..., 1], s * n[..., 0] + c * n[..., 1], n[..., 2]], -1)
+    return Maps(
+        sample(maps.diffuse), sample(maps.specular), sample(maps.roughness), unit_normals(n)
+    )
+
+
 NAMES = ("normal", "diffuse", "roughness", "specular")
 
 
@@ -70,27 +138,6 @@ def constant_maps(
         np.full((height, width), roughness, np.float32),
         np.broadcast_to(np.float32(normal), rgb).copy(),
     )
-
-
-def read_maps(folder: Path) -> Maps:
-    """Read ``diffuse.exr specular.exr roughness.exr normal.exr`` from a folder."""
-    maps = {n: read_image(Path(folder) / f"{n}.exr") for n in NAMES}
-    normal = maps["normal"] * 2 - 1
-    length = np.linalg.norm(normal, axis=-1, keepdims=True)
-    if not np.all(length > 1e-3):
-        raise InputError(f"{folder}/normal.exr has normals of length zero")
-    return Maps(
-        np.clip(maps["diffuse"], 0, 1),
-        np.clip(maps["specular"], 0, 1),
-        np.clip(maps["roughness"].mean(-1), 0, 1),
-        (normal / length).astype(np.float32),
-    )
-
-
-def write_maps(folder: Path, maps: Maps, *, half: bool = False) -> None:
-    """Write the four EXR files into a folder."""
-    for name, image in maps.encoded().items():
-        write_exr(Path(folder) / f"{name}.exr", image, half=half)
 
 
 def map_errors(maps: Maps, truth: Maps) -> dict[str, float]:

@@ -10,16 +10,14 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
-from invrender.errors import InputError
-from invrender.images import linear_to_srgb
+from invrender.colour import linear_to_srgb
 from invrender.lpips import Lpips
 from invrender.maps import Maps, map_errors
 from invrender.rig import Rig
+from invrender.types import Array, InputError
 
-Array = NDArray[np.floating[Any]]
 Metrics = dict[str, float | None]
 RERENDER = 256  # pixels a side that re-rendered images are compared at
 FLIP_MISSING = "FLIP needs flip-evaluator: pip install 'invrender[metrics]'"
@@ -63,7 +61,7 @@ def map_metrics(
     1/2.2; RMSE over all nine images, the other metrics their mean. Images larger than `RERENDER`
     pixels a side are averaged down to that.
     """
-    from invrender.relight import rerender
+    from invrender.render.point_lights import rerender
 
     if maps.shape != truth.shape:
         raise InputError(f"maps of {_size(maps.shape)} and of {_size(truth.shape)} pixels differ")

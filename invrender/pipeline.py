@@ -15,33 +15,25 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from invrender.capture import (
-    Capture,
-    Lights,
-    crop_mask,
-    crop_sample,
-    extract_lights,
-    light_warnings,
-    load_capture,
-)
-from invrender.errors import InputError
-from invrender.maps import Maps, map_errors
-from invrender.materials import resize_maps, turn_maps
-from invrender.mirror import Ball
-from invrender.report import Report
-from invrender.results import write_results
-from invrender.upright import find_upright_ball, posed
+from invrender.capture.crop import crop_mask, crop_sample
+from invrender.capture.lights import Lights, extract_lights, light_warnings
+from invrender.capture.mirror import Ball
+from invrender.capture.orientation import find_upright_ball, posed
+from invrender.files.capture import Capture, load_capture
+from invrender.maps import Maps, map_errors, resize_maps, turn_maps
+from invrender.refine.checks import coarse_error, photo_error
+from invrender.report.page import Report
+from invrender.report.results import write_results
+from invrender.types import Array, InputError
 
-if TYPE_CHECKING:  # Dr.Jit compiles where the refinement is imported
-    from invrender.refine import Refined
+if TYPE_CHECKING:
+    from invrender.refine.gauss_newton import Refined
 
-Array = NDArray[np.floating[Any]]
 FINAL_SAMPLES = 256
 FAR_OFF = 0.1  # of its size that the screen may hang off before the rig is in doubt
 # `coarse_error` from which the maps are in doubt; from a flat start each pixel's albedo explains
 # more.
 POOR_FIT = {"network": 0.25, "flat": 0.1}
-BLOCKS = 16  # a side, whose means the coarse error compares
 BAKED = 0.6  # correlation of albedo and light, negative, from which the lights are in doubt
 
 
@@ -62,8 +54,9 @@ class Seen:
 
     def prepare(self, turn: int = 0) -> Any:
         """The forward model of these lights, turned by quarters about the sample's normal."""
-        from invrender.joint import turned_environment, turned_rig
-        from invrender.render import make_scene, prepare
+        from invrender.refine.several import turned_environment, turned_rig
+        from invrender.render.renderer import prepare
+        from invrender.render.scene import make_scene
 
         rig, room = self.lights.rig, self.lights.environment
         if turn % 4:
@@ -157,11 +150,13 @@ def recover(
         networks = _networks() if init == "network" else None
     with stage("forward model"):
         # Dr.Jit compiles here; nothing before needs it.
-        from invrender.initial import flat_maps
-        from invrender.joint import find_turn
-        from invrender.lobes import fit_lobes
-        from invrender.prior import lobe_prior, network_prior, pooled, to_maps
-        from invrender.refine import Refined, Shot, correct, refine
+        from invrender.refine.cautious import correct
+        from invrender.refine.flat import flat_maps
+        from invrender.refine.gauss_newton import Refined, Shot, refine
+        from invrender.refine.lobes import fit_lobes
+        from invrender.refine.priors import lobe_prior, network_prior, pooled
+        from invrender.refine.several import find_turn
+        from invrender.refine.theta import to_maps
 
         shots = [Shot(s.photo, s.prepare(), s.clipped if s.clipped.any() else None) for s in seen]
     if networks is None:
@@ -220,7 +215,7 @@ def recover(
 
 def _turned(seen: Seen, quarters: int) -> Any:
     """The shot in the frame of a photo that shows the sample ``quarters`` less turned."""
-    from invrender.refine import Shot
+    from invrender.refine.gauss_newton import Shot
 
     clipped = np.rot90(seen.clipped, -quarters) if seen.clipped.any() else None
     photo = np.ascontiguousarray(np.rot90(seen.photo, -quarters))
@@ -260,8 +255,8 @@ def refine_capture(
     start, result, shots = recover(seen, stage, init=init, samples=samples, keep=unfinished)
     first = seen[0]
     with stage("render"):
-        from invrender.initial import baked_light
-        from invrender.render import picture
+        from invrender.refine.checks import baked_light
+        from invrender.render.renderer import picture
 
         lights = shots[0].prepared
         baked = baked_light(result.maps.diffuse, lights, samples)
@@ -309,34 +304,12 @@ def _networks() -> tuple[Any, Any]:
     Raises `InputError` where torch is missing.
     """
     try:
-        from nets.infer import Corrector, Reconstructor
+        from nets.predict import Corrector, Reconstructor
     except ModuleNotFoundError as e:
         raise InputError(
             f"the network needs {e.name}: pip install 'invrender[nets]', or start flat: --init flat"
         ) from None
     return Reconstructor(), Corrector()
-
-
-def photo_error(picture: Array, photo: Array, clipped: NDArray[np.bool_]) -> float:
-    """RMS difference over the photo's mean, where the photo is not saturated."""
-    seen = ~clipped if not clipped.all() else np.ones_like(clipped)
-    difference = (picture - photo)[seen].astype(np.float64)
-    return float(np.sqrt(np.mean(difference**2)) / max(float(photo[seen].mean()), 1e-12))
-
-
-def coarse_error(picture: Array, photo: Array, clipped: NDArray[np.bool_]) -> float:
-    """RMS difference of the means of `BLOCKS` × `BLOCKS` parts over the photo's mean.
-
-    What relief and sharp highlights leave unexplained pixel by pixel averages out; what wrong
-    lights leave does not. Saturated pixels count as explained.
-    """
-    difference = np.where(clipped[..., None], 0, picture - photo).astype(np.float64)
-    size = np.ones(clipped.shape)
-    for axis, n in enumerate(clipped.shape):
-        starts = np.unique(np.arange(BLOCKS) * n // BLOCKS)
-        difference, size = (np.add.reduceat(x, starts, axis) for x in (difference, size))
-    rms = np.sqrt(np.mean((difference / size[..., None]) ** 2))
-    return float(rms / max(float(photo.mean()), 1e-12))
 
 
 def _warnings(seen: Seen, error: float, result: Refined, init: str, baked: float) -> list[str]:

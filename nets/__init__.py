@@ -1,4 +1,5 @@
 """Networks that turn a capture into material maps: data, training and inference, on torch.
 
-`nets.infer.Reconstructor` is what other code calls. `invrender` itself works without this package.
+`nets.predict.Reconstructor` is what other code calls. `invrender` itself works without this
+package.
 """

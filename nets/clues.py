@@ -11,22 +11,14 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from invrender.backend import Float, dr, vector
-from invrender.environments import resample_environment
-from invrender.render import prepare, shade
+from invrender.render.backend import Float, dr, vector
+from invrender.render.renderer import prepare, shade
+from invrender.render.scene import Scene, make_scene, make_view
 from invrender.rig import Rig
-from invrender.scene import Scene, make_scene, make_view
-from nets.splitsum import (
-    area_resize,
-    mask_environment,
-    pack_rig,
-    prefilter_screen,
-    prefilter_sky,
-)
-
-Array = NDArray[np.floating[Any]]
+from invrender.sphere import resample_environment
+from invrender.types import Array
+from nets.splitsum import area_resize, mask_environment, pack_rig, prefilter_screen, prefilter_sky
 
 ALBEDO = 0.6
 ROUGHNESS = (0.2, 0.6)

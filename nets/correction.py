@@ -13,8 +13,8 @@ learn from: so where the photo says nothing of a quantity, it learns to leave it
     photo, image (B, 3, H, W): the photo and the rendering of θ; theta (B, 9, H, W); sigma0
     (B, 4, H, W): expected errors of `MAPS`; jacobian (B, 15, H, W): E/π and B (the derivatives by
     an albedo of the same colour), then ∂I/∂ρ, ∂I/∂p, ∂I/∂q; clipped (B, 1, H, W): one where the
-    photo is saturated; lobes (B, 7, H, W): k_d, k_s and ρ as `invrender.lobes` finds them without a
-    network; position (B, 2, H, W). Radiance in units of that of a white plane.
+    photo is saturated; lobes (B, 7, H, W): k_d, k_s and ρ as `invrender.refine.lobes` finds them
+    without a network; position (B, 2, H, W). Radiance in units of that of a white plane.
 """
 
 from __future__ import annotations

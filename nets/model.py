@@ -6,7 +6,7 @@ pass) → clue encoder; both bottlenecks → fusion → material decoder. A batc
     photo (B, 3, H, W) radiance; position (B, 2, H, W) in [-1, 1]², x right, y up; and the light as
     `nets.clues.light_inputs` gives it, each with a batch axis: env_clues, active_clues,
     slope_clues, sky, screen, ball, pattern, rig; and with ``lobes`` lobes (B, 7, H, W), albedos and
-    roughness as `invrender.lobes` finds them, readings (B, 16, H, W) and costs (B, 40).
+    roughness as `invrender.refine.lobes` finds them, readings (B, 16, H, W) and costs (B, 40).
 
 All of it may be in any unit of radiance: it is divided by that of a white plane first.
 """
@@ -19,17 +19,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from invrender.errors import InputError
+from invrender.types import InputError
 from nets.blocks import Decoder, Encoder, Pointwise, blocks, pad_to
 from nets.slopes import SLOPE_FEATURES, slope_features
-from nets.splitsum import (
-    brdf_table,
-    hit_screen,
-    normal_clues,
-    reflect,
-    sample,
-    view_directions,
-)
+from nets.splitsum import brdf_table, hit_screen, normal_clues, reflect, sample, view_directions
 
 Batch = dict[str, Tensor]
 
@@ -39,7 +32,7 @@ CLUES = ("none", "mirrorball", "plane", "colored", "full")
 MAPS = ("normal", "diffuse", "roughness", "specular")
 LIGHTS = ("env_clues", "active_clues", "slope_clues", "sky", "screen", "ball", "pattern")
 MIN_SIGMA, MAX_SIGMA = 0.002, 1.0
-# What `invrender.lobes` tells of a photo, and its usual f0; training needs no more of it.
+# What `invrender.refine.lobes` tells of a photo, and its usual f0; training needs no more of it.
 READINGS, COSTS, USUAL_F0 = 16, 40, 0.04
 MIXED = 6  # weights of what the photo says of a dielectric and of metal, for three maps
 
@@ -51,12 +44,12 @@ class Config:
 
     active: clues of the screen's light too, and the ratio of the photo to a white plane.
     slopes: how radiance depends on the slopes, and what that says of them (`nets.slopes`).
-    lobes: what all pixels of a material, fitted together, say of it (`invrender.lobes`): as inputs,
-    and each of the network's material maps is a mean of its own and of what the photo says of a
-    dielectric and of bare metal, by weights that the network finds.
-    clue_skips: the material decoder also gets the clue encoder's skips. narrow_fusion: halve the
-    channels before the fusion blocks, not after. correction: not this network but the correction
-    of its maps (`nets.correction`), which heeds sizes alone.
+    lobes: what all pixels of a material, fitted together, say of it (`invrender.refine.lobes`): as
+    inputs, and each of the network's material maps is a mean of its own and of what the photo says
+    of a dielectric and of bare metal, by weights that the network finds. clue_skips: the material
+    decoder also gets the clue encoder's skips. narrow_fusion: halve the channels before the fusion
+    blocks, not after. correction: not this network but the correction of its maps
+    (`nets.correction`), which heeds sizes alone.
     """
 
     width: int = 16

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
-from typing import Any
 
 import numpy as np
 import torch
@@ -26,10 +25,9 @@ from scipy.ndimage import map_coordinates
 from scipy.signal import fftconvolve
 from torch import Tensor
 
-from invrender.environments import directions, resample_environment, solid_angles
 from invrender.rig import Rig
-
-Array = NDArray[np.floating[Any]]
+from invrender.sphere import directions, resample_environment, solid_angles
+from invrender.types import Array
 
 LEVELS = tuple(k / 7 for k in range(8))  # roughness of the paper's 8 mip levels
 SKY_EXTENT = 1.25

@@ -11,7 +11,7 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from invrender.errors import InputError
+from invrender.types import InputError
 from nets.correction import Correction
 from nets.model import Config, Network
 

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from invrender.backend import ad, dr, vector
 from invrender.maps import Maps
-from invrender.render import Material
-from invrender.scene import View, hash_bits
+from invrender.render.backend import ad, dr, vector
+from invrender.render.renderer import Material
+from invrender.render.scene import View, hash_bits
 
 Float64 = ad.Float64
 

@@ -15,25 +15,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from invrender.errors import InputError
+from invrender.data.materials import read_material
 from invrender.export.folders import write_blender, write_unity, write_unreal
 from invrender.export.gltf import write_gltf
+from invrender.export.height import height_from_normals
 from invrender.export.material import Material, height_range
 from invrender.export.materialx import write_materialx
 from invrender.export.mitsuba import write_mitsuba
 from invrender.export.textures import safe_name
-from invrender.height import height_from_normals
-from invrender.images import read_image
+from invrender.export.tileable import make_tileable
+from invrender.files.images import read_image
 from invrender.maps import Maps, map_errors
-from invrender.materials import read_material
 from invrender.rig import Rig
-from invrender.tileable import make_tileable
+from invrender.types import Array, InputError
 
 __all__ = ["TARGETS", "Exported", "Target", "export", "export_maps", "rerender_error"]
 
-Array = NDArray[np.floating[Any]]
 CONVENTIONS = ("opengl", "directx")
 CHECKED = 256  # pixels a side that are re-rendered at most
 
@@ -66,7 +64,7 @@ class Exported:
     errors: for each way of reading the files, the RMSE of each map, their ``average``, and
     ``rerender``, the RMS difference over the mean of the re-rendered images. height: metres of
     black and white, the share of slopes that no surface explains, and their RMS. seams: see
-    `invrender.tileable.Seams`.
+    `invrender.export.tileable.Seams`.
     """
 
     target: str
@@ -169,7 +167,7 @@ def export_maps(
 
 def rerender_error(maps: Maps, truth: Maps) -> float:
     """RMS difference over the mean of nine re-rendered images, at `CHECKED`² pixels or fewer."""
-    from invrender.relight import rerender  # Dr.Jit starts here
+    from invrender.render.point_lights import rerender
 
     step = -(-max(truth.shape) // CHECKED)
     a, b = (

@@ -8,18 +8,15 @@ specular workflow has k_d, k_s and smoothness = 1 - roughness as they are.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from invrender.errors import InputError
 from invrender.export.material import Material, height_texture, normal_texture, normals_seen
 from invrender.export.metalrough import MetalRough, maps_of, with_grey_f0
 from invrender.export.textures import Texture, safe_name, whole_folder, write_textures
 from invrender.maps import Maps
+from invrender.types import Array, InputError
 
-Array = NDArray[np.floating[Any]]
 WHITE_F0 = (
     0.08  # reflectance of "specular" = 1 in Unreal and of "specular IOR level" = 1 in Blender
 )

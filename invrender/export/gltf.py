@@ -15,15 +15,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from invrender.export.material import Material, normal_texture, normals_seen
 from invrender.export.metalrough import F0, MetalRough, maps_of, metal_rough, with_coloured_f0
 from invrender.export.textures import Texture, encoded
-from invrender.images import atomic_path
+from invrender.files.images import atomic_path
 from invrender.maps import Maps
+from invrender.types import Array
 
-Array = NDArray[np.floating[Any]]
 FLOAT, UINT16 = 5126, 5123
 ARRAY_BUFFER, ELEMENT_BUFFER = 34962, 34963
 WORST_DIFFUSE = 0.005  # RMSE of k_d above which the material is written without metal

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from invrender.export.textures import Texture
 from invrender.maps import Maps
-
-Array = NDArray[np.floating[Any]]
+from invrender.types import Array
 
 
 @dataclass(frozen=True)

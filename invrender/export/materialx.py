@@ -10,7 +10,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from invrender.errors import InputError
 from invrender.export.material import (
     Material,
     height_range,
@@ -21,6 +20,7 @@ from invrender.export.material import (
 from invrender.export.metalrough import MetalRough, maps_of, metal_rough
 from invrender.export.textures import SUFFIXES, Texture, safe_name, whole_folder, write_textures
 from invrender.maps import Maps
+from invrender.types import InputError
 
 
 def write_materialx(material: Material, out: Path, format: str, convention: str) -> dict[str, Maps]:

@@ -9,14 +9,12 @@ Six numbers a pixel become four, so the conversion has an error, which the expor
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from invrender.maps import Maps
+from invrender.types import Array
 
-Array = NDArray[np.floating[Any]]
 F0 = 0.04  # of a dielectric with a refractive index of 1.5
 
 

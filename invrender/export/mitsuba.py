@@ -8,18 +8,14 @@ and Mitsuba's separable G. The files therefore hold the doubled albedos, and α 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from invrender.environments import mitsuba_rows
 from invrender.export.material import Material, normal_texture, normals_seen
 from invrender.export.textures import Texture, whole_folder, write_textures
 from invrender.maps import Maps
 from invrender.rig import Rig
-
-Array = NDArray[np.floating[Any]]
+from invrender.sphere import mitsuba_rows
 
 SCENE = """\
 <?xml version="1.0" encoding="utf-8"?>

@@ -19,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from invrender.images import atomic_path, linear_to_srgb, srgb_to_linear, write_exr
+from invrender.colour import linear_to_srgb, srgb_to_linear
+from invrender.files.images import atomic_path, write_exr
+from invrender.types import Array
 
-Array = NDArray[np.floating[Any]]
 SUFFIXES = {"png8": ".png", "png16": ".png", "exr": ".exr", "jpeg": ".jpg"}
 JPEG_QUALITY = 95
 

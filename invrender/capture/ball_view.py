@@ -1,0 +1,125 @@
+"""The part of a photo around the mirror ball, and the curves and edges in it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy import ndimage
+
+from invrender.capture.mirror import horizon_points, outline_points
+from invrender.files.images import Photo
+from invrender.rig import Rig
+from invrender.types import Array
+
+TOE = 0.1  # added to radiance over its median before the logarithm
+BLURS = (0.7, 1.4, 2.8, 5.6, 11.2)  # of the levels, in the view's pixels
+
+
+@dataclass(frozen=True)
+class View:
+    """A part of a photo of ``size`` (H, W), shrunk ``step`` times; it begins at ``origin`` (x, y).
+
+    ``image`` (h, w, 3): linear radiance over its median, at most 20. Photo pixel p is view position
+    (p - origin) / step.
+    """
+
+    origin: Array
+    step: int
+    size: tuple[int, int]
+    image: Array
+
+    @cached_property
+    def tone(self) -> Array:
+        """Logarithm of the radiance, (h, w, 3)."""
+        return np.asarray(np.log(self.image + TOE))
+
+    @cached_property
+    def levels(self) -> Array:
+        """The image ever more blurred, (5, h, w, 3)."""
+        blurred = [ndimage.gaussian_filter(self.image, (a, a, 0), mode="nearest") for a in BLURS]
+        return np.stack(blurred).astype(np.float32)
+
+    @cached_property
+    def tensor(self) -> Array:
+        """The structure tensor of the tone summed over the channels, (h, w, 3): xx, xy, yy."""
+        smooth = ndimage.gaussian_filter(self.tone, (1.2, 1.2, 0), mode="nearest")
+        gy, gx = (
+            ndimage.correlate1d(smooth, [-0.5, 0, 0.5], axis=a, mode="nearest") for a in (0, 1)
+        )
+        parts = [(gx * gx).sum(-1), (gx * gy).sum(-1), (gy * gy).sum(-1)]
+        return np.stack(parts, -1).astype(np.float32)
+
+    @cached_property
+    def noise(self) -> float:
+        """The structure tensor's usual trace."""
+        return float(np.median(self.tensor[..., 0] + self.tensor[..., 2])) + 1e-7
+
+    def at(self, points: Array, rig: Rig) -> Array:
+        """Points in space to view positions (..., 2), x right, y down."""
+        return (rig.project(points, *self.size) - self.origin) / self.step
+
+    def rays(self, positions: Array, rig: Rig) -> Array:
+        """Unit directions (..., 3) from the camera through view positions (..., 2)."""
+        return rig.rays(positions * self.step + self.origin, *self.size)
+
+
+def view_around(photo: Photo, middle: Array, reach: float, shrink: float) -> View:
+    """The photo within ``reach`` pixels of ``middle`` (x, y), shrunk about ``shrink`` times."""
+    step = max(1, round(shrink))
+    low = np.maximum(np.floor(middle - reach), 0).astype(int)
+    high = np.minimum(np.ceil(middle + reach), [photo.width, photo.height]).astype(int)
+    count = np.maximum((high - low) // step, 1)
+    high = low + count * step
+    part = photo.image[low[1] : high[1], low[0] : high[0]]
+    part = part.reshape(count[1], step, count[0], step, 3).mean((1, 3))
+    level = max(float(np.median(part)), 1e-6 * float(part.max()), 1e-12)
+    return View(
+        low.astype(float), step, (photo.height, photo.width), np.minimum(part / level, 20.0)
+    )
+
+
+def horizon_curve(view: View, rig: Rig, theta: Array, count: int) -> Array:
+    """The horizon's image in the view (count, 2) with the ball at ``theta``: x, y, radius."""
+    return view.at(horizon_points(rig, _place(theta), theta[2], count), rig)
+
+
+def outline_curve(view: View, rig: Rig, theta: Array, count: int) -> Array:
+    """The ball's outline in the view, likewise."""
+    return view.at(outline_points(rig, _place(theta), theta[2], count), rig)
+
+
+def _place(theta: Array) -> Array:
+    return np.array([theta[0], theta[1], 0.0])
+
+
+def normals(curve: Array) -> Array:
+    """Outward unit normals (n, 2) of a closed curve (n, 2)."""
+    along = np.roll(curve, -1, 0) - np.roll(curve, 1, 0)
+    normal = np.stack([along[:, 1], -along[:, 0]], -1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    outward = np.sum(normal * (curve - curve.mean(0)), -1, keepdims=True)
+    return np.asarray(normal * np.where(outward < 0, -1, 1))
+
+
+def edges(view: View, curve: Array, normal: Array, reach: float) -> tuple[Array, Array]:
+    """Signed distance (n,) along each normal to the strongest edge, and its weight in [0, 1]."""
+    t = np.arange(-math.ceil(reach * 4) - 8, math.ceil(reach * 4) + 9) / 4
+    at = curve[:, None] + t[None, :, None] * normal[:, None]
+    at = np.stack([at[..., 1] - 0.5, at[..., 0] - 0.5])
+    slope = np.zeros(at.shape[1:])
+    for c in range(3):
+        line = ndimage.map_coordinates(view.tone[..., c], at, order=1, mode="nearest")
+        slope += ndimage.gaussian_filter1d(line, 3.0, axis=1, order=1, mode="nearest") ** 2
+    i = np.argmax(slope[:, 8:-8], 1) + 8
+    row = np.arange(len(curve))
+    a, b, c2 = (np.sqrt(slope[row, i + k]) for k in (-1, 0, 1))
+    bend = a - 2 * b + c2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shift = np.where(bend < 0, 0.5 * (a - c2) / bend, 0)
+    interior = (i > 8) & (i < len(t) - 9)
+    usual = np.median(slope) + 1e-8
+    strength = np.clip(b**2 / (30 * usual) - 0.5, 0, 1)
+    return t[i] + np.clip(shift, -0.5, 0.5) / 4, strength * interior

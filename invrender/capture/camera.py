@@ -1,0 +1,318 @@
+"""The camera's pose from the sample's square in the photo.
+
+A hand holds the camera a few millimetres and degrees off, and the square of the sample is then not
+where the rig says. Its four sides are straight lines along which the photo changes; textures
+change here and there. So for each side and each line near it, the signed change across is averaged
+over pieces of the line, which texture does not survive, and the pieces' squares, relative to what
+is usual, are summed (as a Hough transform does, of gradients). The pose that explains the four best
+lines together, under a Gaussian prior, is taken: eight numbers for six unknowns, and what disagrees
+is told by what is left.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+from scipy import ndimage
+
+from invrender.capture.ball_image import sample_image
+from invrender.capture.ball_rim import TILT_PRIOR
+from invrender.capture.ball_view import View, view_around
+from invrender.files.images import Photo
+from invrender.rig import Rig
+from invrender.types import Array, InputError
+
+PIECES, POINTS = 8, 16  # of a side, and along each
+INSET = 0.03  # of a side, what is left out at its ends
+SHIFT, TILT = 0.028, 1.5  # deviations of the camera's place, in sides; and of its tilt in degrees
+BLUR, WIDE = 1.7, 0.013  # of changes: pixels, sides
+BORDER = 0.3, 0.5  # deviations of a border's place and slope, in pixels
+LEAST = 0.3  # of the greatest change near a side's points, what its border has
+BEST = 5  # lines a side that are combined
+# Pixels of a side, how far off lines are looked for in sides, steps, how far askew in sides; and in
+# pixels the spacing of the places tried, and the deviations of a line's place and slope.
+PASSES = ((256, 0.15, 1, 0.06, 1.0, 1.0, 1.5), (512, 0.02, 2, 0.015, 0.5, 0.8, 1.2))
+MISFIT, UNLIKELY = 25.0, 14.0  # squared deviations: of the lines, two are left; of the pose, six
+# Of three sides, the changes on the line must exceed by so much the greatest tenth of those beside
+# it, and half of the points change most there, or the whole side's by more. Where the rig tells it,
+# the median; then it is kept, unless the changes found elsewhere are that much larger (a sum of
+# four logarithms): a sample may have lines of its own.
+FOUND, MOST, WHOLE, TOLD, BETTER = 2.0, 0.5, 10.0, 12.0, 1.8
+LEAST_SIDE = 32  # pixels of a side that tells anything
+MOVED = 0.004  # of a side, from which a found pose is believed rather than the told one
+# What to expect of the tilt, degrees: as found, and as told where no square is seen.
+FOUND_TILT, TOLD_TILT = 0.3, 2.0
+
+
+def find_camera(photo: Photo, rig: Rig) -> tuple[Rig, float]:
+    """The rig with its camera where the photo's square of the sample says; and the deviation to
+    expect of the camera's tilt, in degrees.
+
+    As told where the square is as plain there, or plain nowhere near.
+    """
+    try:
+        pose = _find(photo, rig)
+    except InputError:  # a camera that no rig may have
+        pose = None
+    if pose is None:
+        return rig, TOLD_TILT
+    at = [corners(photo, r) for r in (rig, _posed(rig, pose))]
+    moved = np.linalg.norm(at[1] - at[0], axis=-1).mean()
+    if moved > MOVED * np.linalg.norm(at[0][1] - at[0][0]):
+        return _posed(rig, pose), FOUND_TILT
+    return rig, TILT_PRIOR
+
+
+def _find(photo: Photo, rig: Rig) -> Array | None:
+    """The camera's pose, in deviations of the prior; None where the square is plain nowhere."""
+    if not _in_photo(photo, corners(photo, rig)):
+        return None
+    views = [_view(photo, rig, pixels) for pixels, *_ in PASSES]
+    told = _sides(views[-1], rig)
+    pose: Array = np.zeros(6)
+    if np.all(told.median > TOLD):  # all four: no need to look elsewhere
+        return pose
+    misfit = 0.0
+    for view, (_, reach, turns, askew, step, *deviations) in zip(views, PASSES, strict=True):
+        for _ in range(turns):
+            if not _inside(view, _ends(view, _posed(rig, pose))):
+                return None
+            pose, misfit = _improve(view, rig, pose, reach, askew, step, np.tile(deviations, 4))
+    found = _sides(view, _posed(rig, pose))
+    likely = misfit <= MISFIT and pose @ pose <= UNLIKELY and found.plain()
+    better = np.log(found.on / told.on).sum() > BETTER
+    if np.sum(told.median > TOLD) >= 3 and not (likely and better):
+        return np.zeros(6)
+    if not likely:
+        return None
+    for _ in range(2):
+        border = _outermost(view, _ends(view, _posed(rig, pose)))
+        pose = pose + _solve(_slopes(view, rig, pose), pose, *border)
+    return pose
+
+
+def _in_photo(photo: Photo, at: Array) -> bool:
+    """Whether a square with those corners is about in the photo, and large enough."""
+    size, middle = np.array([photo.width, photo.height]), at.mean(0)
+    near = np.all((at > -size) & (at < 2 * size)) and np.all((middle > 0) & (middle < size))
+    return bool(near and np.ptp(at, 0).min() > LEAST_SIDE)
+
+
+def corners(photo: Photo, rig: Rig) -> Array:
+    """The sample's corners in photo pixels, (4, 2), one after another around it."""
+    return rig.project(rig.sample_corners, photo.height, photo.width)
+
+
+def _posed(rig: Rig, pose: Array) -> Rig:
+    """The rig with its camera moved: shift and tilt in deviations of the prior."""
+    return replace(
+        rig,
+        camera_shift=tuple(np.add(rig.camera_shift, pose[:3] * SHIFT * rig.sample_size)),
+        camera_tilt=tuple(np.add(rig.camera_tilt, pose[3:] * TILT)),
+    )
+
+
+def _view(photo: Photo, rig: Rig, pixels: float) -> View:
+    """The photo around where the square may be, a side of it about so many pixels."""
+    at = corners(photo, rig)
+    side = float(np.linalg.norm(at[1] - at[0]))
+    half = np.abs(at - at.mean(0)).max() + 1.5 * PASSES[0][1] * side
+    return view_around(photo, at.mean(0), half, side / pixels)
+
+
+def _ends(view: View, rig: Rig) -> Array:
+    """The ends of the square's sides in the view, (side, end, 2)."""
+    at = view.at(rig.sample_corners, rig)
+    return np.stack([at, np.roll(at, -1, 0)], 1)
+
+
+def _inside(view: View, ends: Array) -> bool:
+    shape = view.tone.shape[1::-1]
+    return bool(np.isfinite(ends).all() and (ends > 0).all() and (ends < shape).all())
+
+
+def _improve(
+    view: View, rig: Rig, pose: Array, reach: float, askew: float, step: float, deviation: Array
+) -> tuple[Array, float]:
+    """A better pose, and the squared misfit of its lines."""
+    now = _ends(view, _posed(rig, pose))
+    length = float(np.linalg.norm(now[:, 1] - now[:, 0], axis=-1).mean())
+    best = [_best_lines(view, e, reach * length, askew * length, step) for e in now]
+    fours = np.array(list(product(*best)))  # (combination, side, 3)
+    wanted, gain = fours[..., :2].reshape(len(fours), 8), fours[..., 2].sum(-1)
+    slopes = _slopes(view, rig, pose)
+    moves = _solve(slopes, pose, wanted, deviation)
+    misfit = (((wanted - moves @ slopes.T) / deviation) ** 2).sum(-1)
+    i = np.argmin(misfit / 2 + ((pose + moves) ** 2).sum(-1) / 2 - gain)
+    return pose + moves[i], float(misfit[i])
+
+
+def _slopes(view: View, rig: Rig, pose: Array) -> Array:
+    """By what a pose moves the sides' places and slopes, (8, 6)."""
+    now = _ends(view, _posed(rig, pose))
+    normal = _normals(now)
+
+    def lines(pose: Array) -> Array:
+        """How far each side's ends have moved across: the mean and the difference."""
+        off = ((_ends(view, _posed(rig, pose)) - now) * normal[:, None]).sum(-1)
+        return np.stack([off.mean(1), off[:, 1] - off[:, 0]], -1).ravel()
+
+    return np.stack([(lines(pose + u) - lines(pose - u)) / 0.1 for u in 0.05 * np.eye(6)], -1)
+
+
+def _solve(slopes: Array, pose: Array, wanted: Array, deviation: Array) -> Array:
+    """The most probable moves (..., 6) of a pose where places and slopes should move by ``wanted``
+    (..., 8)."""
+    weight = 1 / deviation**2
+    matrix = slopes.T @ (weight[:, None] * slopes) + np.eye(6)
+    return np.asarray((wanted @ (weight[:, None] * slopes) - pose) @ np.linalg.inv(matrix))
+
+
+def _outermost(view: View, ends: Array) -> tuple[Array, Array]:
+    """Where the sides' outermost changes lie, place and slope, and the deviations of these, (8,).
+
+    A sample has lines beside its border, a plain table has none: from outside inwards the first
+    change that is no table's is the border. A side beside a table that changes as much stays.
+    """
+    t = np.arange(-24, 49) * 0.5
+    outside, near = t >= 9, np.flatnonzero(t <= 9)
+    wanted, deviation = np.zeros((4, 2)), np.tile(np.array(PASSES[-1][-2:]) / 2, (4, 1))
+    for k, side in enumerate(ends):
+        change, u = _changes(view, side, t, BLUR)
+        size = np.sqrt((change**2).sum(0))
+        usual = np.median(size[near].max(0))
+        over = size[near] > max(2.5 * np.quantile(size[outside], 0.95), LEAST * usual)
+        some = over.any(0)
+        first = len(near) - 1 - np.argmax(over[::-1], 0)
+        rows = np.maximum(first - np.arange(7)[:, None], 0)  # the peak behind it
+        peak = t[first - np.argmax(np.take_along_axis(size, rows, 0), 0)]
+        a = np.stack([np.ones_like(u), u - 0.5], -1)[some]
+        line = np.array([np.median(peak[some]), 0.0]) if some.any() else np.zeros(2)
+        for _ in range(10):
+            weight = 1 / (1 + (peak[some] - a @ line) ** 2)
+            line = np.linalg.solve(a.T @ (weight[:, None] * a) + 1e-6 * np.eye(2),
+                                   a.T @ (weight * peak[some]))  # fmt: skip
+        if np.sum(np.abs(peak[some] - a @ line) < 1) > MOST * len(u):
+            wanted[k], deviation[k] = line, BORDER
+    return wanted.ravel(), deviation.ravel()
+
+
+def _normals(ends: Array) -> Array:
+    """Outward unit normals (..., 2) of sides (..., 2, 2)."""
+    along = ends[..., 1, :] - ends[..., 0, :]
+    length = np.linalg.norm(along, axis=-1, keepdims=True)
+    return np.stack([-along[..., 1], along[..., 0]], -1) / length
+
+
+def _changes(view: View, ends: Array, t: Array, blur: float) -> tuple[Array, Array]:
+    """How the tone changes across a side (2, 2) at distances t (n,) from it: (3, n, points); and
+    where on the side the points are, from 0 to 1."""
+    u = (np.arange(PIECES * POINTS) + 0.5) / (PIECES * POINTS) * (1 - 2 * INSET) + INSET
+    step = t[1] - t[0]
+    more = round(3 * blur / step)
+    far = np.concatenate(
+        [t[0] - step * np.arange(more, 0, -1), t, t[-1] + step * np.arange(1, more + 1)]
+    )
+    at = (ends[0] + (ends[1] - ends[0]) * u[:, None]) + far[:, None, None] * _normals(ends)
+    across = np.ascontiguousarray(np.moveaxis(sample_image(view.tone, at), -1, 0))
+    change = ndimage.gaussian_filter1d(across, blur / step, axis=1, order=1)
+    return change[:, more : more + len(t)], u
+
+
+def _even(change: Array) -> Array:
+    """Changes such that no single one outweighs the others, in [-1, 1]."""
+    return change / np.sqrt(change**2 + (4 * np.median(np.abs(change)) + 1e-6) ** 2)
+
+
+def _power(change: Array) -> Array:
+    """Squares (..., pieces) of the means of changes (3, ..., points) over pieces of the line."""
+    pieces = change.reshape(*change.shape[:-1], PIECES, POINTS) @ np.full(POINTS, 1 / POINTS)
+    return np.asarray((pieces**2).sum(0))
+
+
+@dataclass(frozen=True)
+class _Sides:
+    """How plain the square's sides are, (4,) each.
+
+    ``on``: the changes on it; ``median``, ``tenth``: over the median and the greatest tenth of
+    those beside it; ``most``: the share of its points that change most there. ``wide``: as
+    ``tenth``, of changes over a hundredth of the side; ``whole``: the same, of the whole side's
+    mean.
+    """
+
+    on: Array
+    median: Array
+    tenth: Array
+    most: Array
+    wide: Array
+    whole: Array
+
+    def plain(self) -> bool:
+        """Whether three are lines, or steps, as textures make none."""
+        sharp = (self.tenth > FOUND) & (self.most > MOST)
+        step = (self.wide > FOUND) & (self.whole > WHOLE)
+        return bool(max(sharp.sum(), step.sum()) >= 3)
+
+
+def _sides(view: View, rig: Rig) -> _Sides:
+    """Next to nothing where the view does not show all of them."""
+    ends = _ends(view, rig)
+    out = np.full((6, 4), 1e-3)
+    if _inside(view, ends):
+        out[:] = np.transpose([_side(view, side) for side in ends])
+    return _Sides(*out)
+
+
+def _side(view: View, side: Array) -> tuple[Any, ...]:
+    """The numbers of `_Sides` for one side (2, 2)."""
+    t = np.arange(-30, 31) * 0.5
+    change, _ = _changes(view, side, t, BLUR)
+    power = _power(_even(change))
+    on, beside = power[np.abs(t) <= 1].max(0), power[np.abs(t) >= 4]
+    usual = (np.quantile(beside, q, axis=0) + 1e-4 for q in (0.5, 0.9))
+    most = np.abs(t[np.argmax((change**2).sum(0), 0)]) <= 1.5
+    t = np.arange(-60.0, 61)
+    near, far = np.abs(t) <= 3, np.abs(t) >= 20
+    change, _ = _changes(view, side, t, WIDE * float(np.linalg.norm(side[1] - side[0])))
+    power = _power(_even(change))
+    wide = np.median(power[near].max(0) / (np.quantile(power[far], 0.9, axis=0) + 1e-4))
+    mean = (change.mean(-1) ** 2).sum(0)
+    whole = mean[near].max() / (np.quantile(mean[far], 0.9) + 1e-9)
+    return np.median(on) + 1e-3, *(np.median(on / u) for u in usual), most.mean(), wide, whole
+
+
+def _best_lines(view: View, ends: Array, reach: float, askew: float, step: float) -> list[Array]:
+    """The `BEST` lines near a side (2, 2): place, slope, and how much plainer than usual.
+
+    Place and slope in pixels outwards.
+    """
+    n, m = round(reach / step), round(askew / step)
+    places, slopes = np.arange(-n, n + 1) * step, np.arange(-m, m + 1) * step
+    far = n + round(askew / step / 2) + 1
+    plain = np.zeros((len(slopes), len(places)))
+    length = float(np.linalg.norm(ends[1] - ends[0]))
+    for blur in (BLUR, WIDE * length):
+        change, u = _changes(view, ends, np.arange(-far, far + 1) * step, blur)
+        first = np.round(slopes[:, None] * (u - 0.5) / step).astype(int) + far - n
+        row = first[:, None] + np.arange(2 * n + 1)[:, None]  # (slope, place, point)
+        power = _power(_even(change)[:, row, np.arange(len(u))])
+        power /= np.median(power, (0, 1)) + 1e-4
+        plain += np.log1p(power / 3).sum(-1)
+    peaks = np.argwhere(plain == ndimage.maximum_filter(plain, 9))
+    peaks = peaks[np.argsort(-plain[tuple(peaks.T)])][:BEST]
+    return [
+        np.array([places[j] + step * _top(plain[i], j), slopes[i] + step * _top(plain[:, j], i),
+                  plain[i, j]])
+        for i, j in peaks
+    ]  # fmt: skip
+
+
+def _top(values: Array, i: int) -> float:
+    """How far beside its greatest value, at ``i``, a parabola through three has its top."""
+    if not 0 < i < len(values) - 1:
+        return 0.0
+    a, b, c = values[i - 1 : i + 2]
+    return float(0.5 * (a - c) / min(a - 2 * b + c, -1e-9))

@@ -1,0 +1,103 @@
+"""From the mirror ball's image to the light: the environment, and the pattern on the screen.
+
+Everything follows single rays: a photo's pixel sees a point of the ball, and there, mirrored, a
+direction. Nothing is taken as infinitely far or orthographic except the environment itself.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import spsolve
+
+from invrender.capture.ball_image import SCREEN_MARGIN, sample_image, screen_mask
+from invrender.capture.mirror import Ball, mirror_normals
+from invrender.files.images import Photo
+from invrender.rig import Rig
+from invrender.sphere import directions
+from invrender.types import Array, InputError
+
+MARGIN_BLURS = 1.5
+
+
+def unfold_environment(
+    photo: Photo, rig: Rig, ball: Ball, height: int = 128, samples: int = 4, blur: float = 0.0
+) -> tuple[Array, Array]:
+    """The environment as the ball shows it: radiance (H, 2H, 3) and coverage (H, 2H) in [0, 1].
+
+    Each texel averages samples² directions; for each the point of the ball that mirrors it into
+    the camera is found and the photo looked up there. Coverage is the share of a texel that is
+    above the horizon and not behind the screen; radiance is the mean over that share. The mirror's
+    reflectance is divided out. ``blur``: the camera's, in pixels; as far as it spreads the screen's
+    light, the room beside it counts as hidden.
+    """
+    mask, (rows, columns) = screen_mask(rig, ball, SCREEN_MARGIN + MARGIN_BLURS * blur)
+    origin = (rows.start, columns.start)
+    half = height // 2
+    wanted = directions(samples * height, 2 * samples * height)[: half * samples].astype(float)
+    centre = np.asarray(ball.position)
+    normal = mirror_normals(rig, centre, ball.radius_m, wanted, False)
+    pixels = rig.project(centre + ball.radius_m * normal, *ball.size)
+    free = sample_image(mask, pixels, origin) < 0.01
+    light = sample_image(photo.image[rows, columns], pixels, origin) * free[..., None]
+
+    def pool(a: Array) -> Array:
+        return a.reshape(half, samples, 2 * height, samples, -1).sum((1, 3))
+
+    count = pool(free.astype(np.float32))
+    environment = np.zeros((height, 2 * height, 3), np.float32)
+    coverage = np.zeros((height, 2 * height), np.float32)
+    environment[:half] = pool(light) / np.maximum(count, 1) / np.asarray(rig.ball_reflectance)
+    coverage[:half] = count[..., 0] / samples**2
+    return environment, coverage
+
+
+def fill_environment(environment: Array, coverage: Array) -> Array:
+    """Fill the upper hemisphere where coverage is nil, smoothly from what surrounds the gap.
+
+    Harmonic on the sphere (Laplace's equation with the seen texels as its boundary), in the
+    logarithm of the radiance, so that a lamp beside the screen does not spread behind it. The lower
+    hemisphere is left as it is.
+    """
+    height, width = coverage.shape
+    half = height // 2
+    hole = coverage[:half] <= 0
+    if not hole.any():
+        return environment
+    if hole.all():
+        raise InputError("the mirror ball shows nothing but the screen: check the rig's sizes")
+    known = environment[:half][~hole]
+    floor = np.maximum(known.mean(0) * 1e-3, 1e-9)
+    log = np.log(np.maximum(environment[:half], floor)).reshape(-1, 3).astype(np.float64)
+    index = np.full(half * width, -1)
+    unknown = np.flatnonzero(hole.reshape(-1))
+    index[unknown] = np.arange(unknown.size)
+    r, c = np.divmod(unknown, width)
+    # Conductances of the grid's edges: length of the shared side over distance of the centres.
+    sine = np.sin(np.pi * (np.arange(half) + 0.5) / height)
+    side_up = np.sin(np.pi * np.arange(half + 1) / height)
+    step_u, step_v = 2 * np.pi / width, np.pi / height
+    neighbours = [
+        (r, (c - 1) % width, step_v / (step_u * sine[r])),
+        (r, (c + 1) % width, step_v / (step_u * sine[r])),
+        (r - 1, c, side_up[r] * step_u / step_v),  # nought at the zenith
+        (r + 1, c, np.where(r + 1 < half, side_up[r + 1] * step_u / step_v, 0)),
+    ]
+    diagonal = np.zeros(unknown.size)
+    right = np.zeros((unknown.size, 3))
+    triples = []
+    here = np.arange(unknown.size)
+    for nr, nc, weight in neighbours:
+        flat = np.clip(nr, 0, half - 1) * width + nc
+        diagonal += weight
+        other = index[flat]
+        inside = other >= 0
+        triples.append((here[inside], other[inside], -weight[inside]))
+        np.add.at(right, here[~inside], weight[~inside, None] * log[flat[~inside]])
+    triples.append((here, here, diagonal))
+    i, j, value = (np.concatenate(part) for part in zip(*triples, strict=True))
+    matrix = sparse.csc_matrix((value, (i, j)), shape=(unknown.size,) * 2)
+    solution = spsolve(matrix, right)
+    filled = environment.copy()
+    filled[:half].reshape(-1, 3)[unknown] = np.exp(solution)
+    return filled

@@ -1,0 +1,84 @@
+"""Many captures, one after the other, in processes or on a cluster; one that fails stops none."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from invrender.report.page import Report
+from invrender.tasks import map_tasks
+from invrender.types import InputError
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one capture: "done", "skipped" (it was there already) or "failed".
+
+    report: None where it failed, and ``error`` tells why in one sentence.
+    """
+
+    name: str
+    status: str
+    report: Report | None = None
+    error: str = ""
+
+
+def refine_captures(
+    folders: Sequence[Path],
+    out: Path,
+    *,
+    scheduler: str | None = None,
+    workers: int = 1,
+    **options: Any,
+) -> Iterator[Outcome]:
+    """Refine each capture into ``out``/NAME, the name of its folder; yields outcomes as they come.
+
+    A result that is there already, whole and of the same size and start, is not made again.
+    scheduler, workers: see `invrender.tasks.map_tasks`. options: those of
+    `invrender.pipeline.refine_capture`. Raises `InputError` for two captures of one
+    name, or no worker.
+    """
+    if workers < 1:
+        raise InputError(f"the number of workers must be at least one, got {workers}")
+    folders, out = [Path(f).resolve() for f in folders], Path(out)
+    names = [f.name for f in folders]
+    twice = sorted({n for n in names if names.count(n) > 1})
+    if twice:
+        raise InputError(f"two captures have the name '{twice[0]}'; rename one of the folders")
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out} is a file; choose a folder for the results")
+    jobs = []
+    for folder, name in zip(folders, names, strict=True):
+        report = finished(out / name, options.get("size", 256), options.get("init", "network"))
+        if report is not None:
+            yield Outcome(name, "skipped", report)
+        else:
+            jobs.append((folder, out / name, options))
+    for done in map_tasks(_refine, jobs, scheduler, workers):
+        name = jobs[done.index][1].name
+        if done.error is None:
+            yield Outcome(name, "done", done.result)
+        elif isinstance(done.error, InputError):
+            yield Outcome(name, "failed", error=str(done.error))
+        else:
+            yield Outcome(name, "failed", error=f"{type(done.error).__name__}: {done.error}")
+
+
+def finished(folder: Path, size: int, init: str) -> Report | None:
+    """The report of a result that needs no second run, else None. It is the last file written."""
+    try:
+        report = Report(**json.loads((folder / "report.json").read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError):
+        return None
+    stopped = any(w.startswith("interrupted") for w in report.warnings)
+    return report if (report.size, report.init) == (size, init) and not stopped else None
+
+
+def _refine(job: tuple[Path, Path, dict[str, Any]]) -> Report:
+    from invrender.pipeline import refine_capture
+
+    folder, out, options = job
+    return refine_capture(folder, out, **options)

@@ -1,0 +1,117 @@
+"""``invrender pattern``: the light pattern, for a device or for another rig, and the guide."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import Progress
+
+from invrender.types import InputError
+
+
+def add_parser(commands: Any) -> None:
+    """Add the sub-command to argparse's sub-parsers."""
+    parser = commands.add_parser(
+        "pattern",
+        help="write the light pattern for a display, the capture guide, or optimise a pattern",
+        description="Write the light pattern: as an image for the capture's folder (PNG, EXR); as "
+        "a page that a tablet's browser shows at its real size (HTML); as a PNG for a display of "
+        "known --ppi. The sample looks at the display from below, so that devices must show it "
+        "mirrored; the last two are. A PDF is the guide: the rig drawn to scale, and a template.",
+    )
+    parser.add_argument(
+        "-o", "--out", type=Path, required=True, help="PNG (sRGB), EXR (linear), HTML or PDF"
+    )
+    parser.add_argument("--size", type=int, help="pixels a side of an image (1024)")
+    parser.add_argument(
+        "--ppi",
+        type=float,
+        help="pixels an inch of the device: the image, or the page, has the rig's size on it",
+    )
+    parser.add_argument("--mirrored", action="store_true", help="as the device must show it")
+    parser.add_argument(
+        "--optimise",
+        action="store_true",
+        help="search for the best pattern of a rig instead of taking the default (about a minute)",
+    )
+    parser.add_argument("--rig", type=Path, help="rig.toml, for the sizes (the default rig)")
+    parser.add_argument("--seed", type=int, default=0, help="of the search (0)")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace, console: Console) -> int:
+    """Run the sub-command."""
+    from invrender.files.images import atomic_path, write_exr, write_png
+    from invrender.files.rig_toml import read_rig
+    from invrender.pattern.default import default_pattern, mirrored
+    from invrender.pattern.display import pattern_page, write_display_png
+    from invrender.pattern.guide import write_guide
+    from invrender.rig import Rig
+    from invrender.sampling import resize_pattern
+
+    suffix = args.out.suffix.lower()
+    if suffix not in (".png", ".exr", ".html", ".pdf"):
+        raise InputError(f"{args.out}: the pattern is a .png, .exr or .html, the guide a .pdf")
+    size = 1024 if args.size is None else args.size
+    if not 1 <= size <= 8192:
+        raise InputError("the pattern's size must be between 1 and 8192")
+    real = suffix == ".html" or args.ppi is not None
+    if args.ppi is not None and suffix not in (".png", ".html"):
+        raise InputError("--ppi is for .png and .html")
+    if args.size is not None and (real or suffix == ".pdf"):
+        raise InputError("--size is for images without --ppi; real sizes are those of the rig")
+    if args.seed < 0:
+        raise InputError("the seed must not be negative")
+    if not args.out.resolve().parent.is_dir():
+        raise InputError(f"{args.out.parent} is not a folder")
+    if args.rig and not (args.optimise or real or suffix == ".pdf"):
+        raise InputError(
+            "--rig is for --optimise, --ppi, .html and .pdf; the default pattern is the same for "
+            "all rigs"
+        )
+    rig = read_rig(args.rig)[0] if args.rig else Rig()
+    if suffix == ".pdf":
+        if args.optimise or args.mirrored:
+            raise InputError("the guide has no pattern: leave out --optimise and --mirrored")
+        write_guide(args.out, rig)
+        console.print(f"wrote {args.out}", highlight=False)
+        return 0
+    if args.optimise:
+        import numpy as np
+
+        from invrender.pattern.design import CELLS, NAMES, design
+
+        compare: dict[str, Any] = {
+            "white": np.ones((CELLS, CELLS, 3)),
+            "default": resize_pattern(default_pattern(), CELLS),
+        }
+        with Progress(console=console, transient=True) as bar:
+            task = bar.add_task("optimising", total=1.0)
+            found = design(
+                rig, compare, seed=args.seed, progress=lambda f: bar.update(task, completed=f)
+            )
+        for name, errors in found.errors.items():
+            parts = ", ".join(f"{m} {errors[m]:.4f}" for m in NAMES)
+            console.print(
+                f"  {name:>9}: expected error {parts}; criterion {errors['criterion']:.3f}",
+                highlight=False,
+                soft_wrap=True,
+            )
+        pattern = found.pattern
+    else:
+        pattern = default_pattern()
+    if suffix == ".html":
+        page = pattern_page(pattern, rig.screen_size, args.ppi)
+        with atomic_path(args.out) as path:
+            path.write_text(page, encoding="utf-8")
+    elif real:
+        write_display_png(args.out, pattern, rig.screen_size, args.ppi)
+    else:
+        image = resize_pattern(pattern, size)
+        image = mirrored(image) if args.mirrored else image
+        (write_png if suffix == ".png" else write_exr)(args.out, image)
+    console.print(f"wrote {args.out}", highlight=False)
+    return 0

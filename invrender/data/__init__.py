@@ -1,0 +1,1 @@
+"""Materials, environments and simulated captures, and the bundled example."""

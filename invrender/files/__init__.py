@@ -1,0 +1,1 @@
+"""Files in and out: images, camera raw, rig.toml, capture folders and map folders."""

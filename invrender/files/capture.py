@@ -1,0 +1,95 @@
+"""A capture folder: photo, rig and pattern, and the truth of synthetic ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from invrender.files.images import PHOTOS, Photo, read_image, read_photo
+from invrender.files.maps import read_maps
+from invrender.files.rig_toml import read_rig
+from invrender.maps import Maps
+from invrender.rig import Rig
+from invrender.types import Array, InputError
+
+MIN_PHOTO = 64
+
+
+@dataclass(frozen=True)
+class Capture:
+    """One capture. ``pattern`` (h, w, 3) is the ideal one, relative radiance in [0, 1].
+
+    ``truth`` and ``true_environment`` come with synthetic captures only: to measure errors
+    against, never an input.
+    """
+
+    photo: Photo
+    rig: Rig
+    pattern: Array
+    truth: Maps | None = None
+    true_environment: Array | None = None
+
+
+def load_capture(folder: Path) -> Capture:
+    """Read a capture folder: ``photo.*``, ``rig.toml``, the pattern, and the truth if there is any.
+
+    Raises `InputError`, one sentence, for anything missing, damaged or out of range.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder")
+    names = {"photo" + suffix for suffix in PHOTOS}
+    photos = sorted(p for p in folder.iterdir() if p.name.lower() in names and p.is_file())
+    if not photos:
+        raise InputError(f"{folder} has no photo (photo with one of {', '.join(PHOTOS)})")
+    if len(photos) > 1:
+        found = ", ".join(p.name for p in photos)
+        raise InputError(f"{folder} has more than one photo ({found}); leave one")
+    photo = read_photo(photos[0])
+    check_photo(photo, str(photos[0]))
+    rig, files = read_rig(folder / "rig.toml", fov=photo.fov)
+    pattern_path = _inside(folder, files.get("pattern") or _find_pattern(folder))
+    pattern = read_image(pattern_path)
+    if pattern.min() < 0 or pattern.max() > 1 + 1e-3:
+        raise InputError(f"{pattern_path}: the pattern must be relative radiance in [0, 1]")
+    if not pattern.max() > 0:
+        raise InputError(f"{pattern_path}: the pattern is all black")
+    truth = environment = None
+    if "sample" in files:
+        maps = _inside(folder, files["sample"])
+        truth = read_maps(maps)
+        if (maps / "environment.exr").is_file():
+            environment = read_image(maps / "environment.exr")
+    return Capture(photo, rig, np.clip(pattern, 0, 1), truth, environment)
+
+
+def check_photo(photo: Photo, name: str = "the photo") -> None:
+    """Raise `InputError` for a photo that cannot be a capture: too small, or black."""
+    if min(photo.height, photo.width) < MIN_PHOTO:
+        raise InputError(
+            f"{name} is {photo.width} × {photo.height} pixels, too small for a capture"
+        )
+    if not photo.image.max() > 0:
+        raise InputError(f"{name} is all black")
+
+
+def _inside(folder: Path, name: str) -> Path:
+    """A file named in ``rig.toml``; it must lie in the capture's folder."""
+    path = folder / name
+    try:
+        path.exists()  # raises for what is too long, or has a null in it
+        inside = path.resolve().is_relative_to(folder.resolve())
+    except (OSError, ValueError):
+        raise InputError(f"{folder}/rig.toml: {name[:40]!r} is no file name") from None
+    if not inside:
+        raise InputError(f"{folder}/rig.toml: '{name}' leads out of the capture's folder")
+    return path
+
+
+def _find_pattern(folder: Path) -> str:
+    for name in ("pattern.exr", "pattern.png"):
+        if (folder / name).is_file():
+            return name
+    raise InputError(f"{folder} has no pattern: set [pattern] image in rig.toml")

@@ -1,0 +1,1 @@
+"""The light pattern: the default one, the page that shows it, the printed guide, its design."""

@@ -1,0 +1,81 @@
+"""The light pattern for a device: a page for its browser, or an image that knows its size."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import io
+from importlib import resources
+from pathlib import Path
+
+import jinja2
+import numpy as np
+from PIL import Image
+
+from invrender.colour import linear_to_srgb
+from invrender.files.images import atomic_path
+from invrender.pattern.default import mirrored
+from invrender.sampling import resize_pattern
+from invrender.types import Array, InputError
+
+PAGE_PIXELS = 768  # a side of the page's image: the pattern has no finer detail
+LARGEST = 8192  # pixels a side
+INCH = 0.0254
+
+
+def device_pixels(size: float, ppi: float) -> int:
+    """Pixels a side of a pattern of ``size`` metres. Raises `InputError` for impossible ones."""
+    if not 30 <= ppi <= 2000:
+        raise InputError(f"a display has 30 to 2000 pixels an inch, not {ppi:g}")
+    pixels = round(size / INCH * ppi)
+    if not 1 <= pixels <= LARGEST:
+        raise InputError(
+            f"a pattern of {1000 * size:g} mm at {ppi:g} pixels an inch would be {pixels} pixels "
+            f"wide; 1 to {LARGEST} are possible"
+        )
+    return pixels
+
+
+def write_display_png(path: Path, pattern: Array, size: float, ppi: float) -> None:
+    """Write the pattern (h, w, 3) as a device must show it, mirrored, ``size`` metres a side.
+
+    The file states its resolution (pHYs). Raises `InputError` for impossible sizes.
+    """
+    image = _encoded(pattern, device_pixels(size, ppi))
+    with atomic_path(path) as temporary:
+        image.save(temporary, format="PNG", dpi=(ppi, ppi))
+
+
+def pattern_page(pattern: Array, size: float, ppi: float | None = None) -> str:
+    """An HTML page that shows the pattern (h, w, 3), mirrored, ``size`` metres a side.
+
+    It is one file and loads nothing: its content security policy allows the image inside it and
+    its one script, by that script's hash. Without ``ppi``, the display's pixels an inch, its user
+    finds the scale with a bank card.
+    """
+    if ppi is not None:
+        device_pixels(size, ppi)
+    out = io.BytesIO()
+    _encoded(pattern, PAGE_PIXELS).save(out, "PNG")
+    script = _data("page.js")
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(
+        _data("page.html.j2")
+    )
+    return page.render(
+        css=_data("page.css"),
+        script=script,
+        script_hash=f"sha256-{digest}",
+        uri="data:image/png;base64," + base64.b64encode(out.getvalue()).decode(),
+        mm=1000 * size,
+        ppi=ppi,
+    )
+
+
+def _encoded(pattern: Array, pixels: int) -> Image.Image:
+    data = linear_to_srgb(mirrored(resize_pattern(pattern, pixels)))
+    return Image.fromarray((data * 255 + 0.5).astype(np.uint8))
+
+
+def _data(name: str) -> str:
+    return (resources.files("invrender") / "pattern" / "page" / name).read_text(encoding="utf-8")

@@ -1,0 +1,176 @@
+"""The capture guide: two pages of A4, the rig drawn to scale and a template in its real size."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from invrender.files.images import atomic_path
+from invrender.rig import Rig
+
+MM = 1 / 25.4  # inches
+PAGE = (210.0, 297.0)  # A4, mm
+MARGIN = 15.0
+SCALES = (1, 2, 2.5, 5, 10, 20, 50, 100)
+INK, SOFT, SCREEN, BALL = "#1c1d20", "#74767c", "#2f6fb0", "#b04a2f"
+DIAGONAL = math.hypot(36, 24)  # mm, of the 35 mm frame
+
+
+def write_guide(path: Path, rig: Rig) -> None:
+    """Write the guide of a ``rig`` as a PDF; its drawing's scale is printed on it."""
+    from matplotlib.backends.backend_pdf import PdfPages
+    from matplotlib.figure import Figure
+
+    with atomic_path(path) as temporary, PdfPages(temporary) as pdf:
+        for draw in (_guide, _template):
+            figure = Figure(figsize=(PAGE[0] * MM, PAGE[1] * MM))
+            draw(figure, rig)
+            pdf.savefig(figure)
+        pdf.infodict()["Title"] = "invrender: capture guide"
+
+
+def needed_focal(rig: Rig) -> float:
+    """Longest lens, as its 35 mm equivalent, whose 4:3 photo shows the whole sample.
+
+    In millimetres, by CIPA DCG-001 (diagonals); 5% of the photo's half width are kept free.
+    """
+    tangent = (rig.optical_axis_x + rig.sample_size / 2) / rig.screen_height
+    return DIAGONAL / 2 * 0.8 / tangent * 0.95
+
+
+def _axes(figure: Any, x: float, y: float, scale: float) -> Any:
+    """Axes over the page in millimetres of the rig, (0, 0) at (x, y) of the page from above."""
+    axes = figure.add_axes((0, 0, 1, 1))
+    axes.set_axis_off()
+    axes.patch.set_alpha(0)
+    axes.set_xlim(-x * scale, (PAGE[0] - x) * scale)
+    axes.set_ylim(-(PAGE[1] - y) * scale, y * scale)
+    return axes
+
+
+def _guide(figure: Any, rig: Rig) -> None:
+    l, h, r = 1000 * rig.screen_size, 1000 * rig.screen_height, 1000 * rig.ball_radius
+    delta, axis = 1000 * rig.camera_offset, 1000 * rig.optical_axis_x
+    left, right = -0.75 * l - delta, axis + r + 22 * l / 90
+    wide, high = right - left + 40, 1.25 * h + l * 1.15
+    scale = next(
+        (s for s in SCALES if wide / s < PAGE[0] - 2 * MARGIN and high / s < 205), SCALES[-1]
+    )
+    page = _axes(figure, 0, 0, 1)
+    x0 = MARGIN + (-left + 20) / scale
+    text = page.text
+    text(MARGIN, -20, "Capture guide", size=17, weight="bold", color=INK)
+    text(MARGIN, -26, f"Drawn at 1 : {scale:g}, lengths in millimetres.", size=9, color=SOFT)
+
+    # From the side.
+    y0 = 38 + h * 1.12 / scale
+    side = _axes(figure, x0, y0, scale)
+    side.text(left, h * 1.12, "From the side", size=10, weight="bold", color=INK)
+    side.plot([left - 8, right + 8], [0, 0], color=INK, lw=1)
+    side.plot([-l / 4, l / 4], [0, 0], color=INK, lw=4, solid_capstyle="butt")
+    side.text(0, 3 * scale, "sample", ha="center", size=8, color=INK)
+    side.plot([left, l / 4 - delta], [h, h], color=SCREEN, lw=4, solid_capstyle="butt")
+    side.text(left, h + 2.5 * scale, "pattern, facing down", size=8, color=SCREEN)  # fmt: skip
+    angle = np.linspace(0, math.pi, 60)
+    side.fill(axis + r * np.cos(angle), r * np.sin(angle), color=BALL)
+    side.text(axis + r + 1.5 * scale, 2 * scale, f"mirror ball\nradius {r:.1f}", size=8,
+              color=BALL)  # fmt: skip
+    side.plot([axis, axis], [r, h], color=SOFT, lw=0.7, ls=(0, (5, 4)))
+    side.plot([axis], [h], marker="o", ms=5, color=INK)
+    side.text(axis + 2 * scale, h + 2.5 * scale, "lens, looking straight down", size=8, ha="center",
+              color=INK)  # fmt: skip
+    for x in (-l / 4, l / 4):  # the ways that mirror the screen's edges into the lens
+        side.plot([2 * x - axis, x, axis], [h, 0, h], color=SOFT, lw=0.5)
+    _length(side, (right, 0), (right, h), f"{h:.0f}", scale)
+    _length(side, (l / 4 - delta, h * 0.9), (axis, h * 0.9), f"{2 * delta:.0f}", scale)
+
+    # From above, in the photo's orientation.
+    y1 = y0 + 14 + (l / 2 * 1.12) / scale
+    above = _axes(figure, x0, y1, scale)
+    above.text(left, l / 2 + 3 * scale, "From above, as the photo shows it", size=10,
+               weight="bold", color=INK)  # fmt: skip
+    _rectangle(above, left, -l / 2, l, l, SCREEN, ls="--", lw=1)
+    above.text(left + 2 * scale, -l / 2 + 2 * scale, "pattern (above)", size=8, color=SCREEN)
+    _rectangle(above, -l / 4, -l / 4, l / 2, l / 2, INK, lw=1.4)
+    above.text(0, 0, "sample", ha="center", va="center", size=8, color=INK)
+    turn = np.linspace(0, 2 * math.pi, 90)
+    above.fill(axis + r * np.cos(turn), r * np.sin(turn), color=BALL)
+    above.text(axis, r + 2 * scale, "ball, below the lens", ha="center", size=8, color=BALL)
+    _length(above, (left, -l / 2 - 5 * scale), (left + l, -l / 2 - 5 * scale), f"{l:.0f}", scale)
+    _length(above, (-l / 4, -l / 4 - 5 * scale), (l / 4, -l / 4 - 5 * scale), f"{l / 2:.0f}", scale)
+    _length(above, (0, -l / 8), (axis, -l / 8), f"{axis:.0f}", scale)
+    above.annotate("photo's top", (right, l / 2), (right, l / 4), ha="center", size=8, color=SOFT,
+                   arrowprops={"arrowstyle": "->", "color": SOFT})  # fmt: skip
+
+    y = -(y1 + l / 2 / scale + 16)
+    fov, focal = rig.fov, needed_focal(rig)
+    for i, line in enumerate((
+        "Lay the sample flat, stand the ball beside it; page 2 is a template for both.",
+        "On a sample larger than its square lay page 2 with the square cut out: its edge tells "
+        "where the camera was.",
+        "Show the pattern at its real size and full brightness; switch off automatic brightness, "
+        "night light and tone adaptation.",
+        f"Hold the display {h:.0f} mm above the table, face down and level, its top edge where the "
+        "photo's top is.",
+        f"The lens is beside the pattern, {2 * delta:.0f} mm from its edge, at the same height, "
+        "straight above the ball.",
+        f"Lens of {focal:.0f} mm or less (35 mm equivalent; rig.toml says {fov:.0f}° across); "
+        "no zoom, no portrait mode, no filters, no flash.",
+        "Focus on the sample and lock it. Expose so that neither the sample nor the pattern in the "
+        "ball is white. Raw is best.",
+        "The photo shows the whole sample, and the ball in its middle. Keep hands and head out of "
+        "the ball's view.",
+        "invrender inspect FOLDER tells whether it was a good one.",
+    )):  # fmt: skip
+        text(MARGIN, y - 5.1 * i, f"{i + 1}.", size=8.5, color=SOFT)
+        text(MARGIN + 6, y - 5.1 * i, line, size=8.2, color=INK)
+
+
+def _template(figure: Any, rig: Rig) -> None:
+    """The places of sample and ball in real size, and a line to check the printer's scale by."""
+    half, r = 500 * rig.sample_size, 1000 * rig.ball_radius
+    axis = 1000 * rig.optical_axis_x
+    page = _axes(figure, 0, 0, 1)
+    page.text(MARGIN, -20, "Template, 1 : 1", size=17, weight="bold", color=INK)
+    page.text(MARGIN, -26, "Print at 100%, not fitted to the page; the line below is 100 mm long.",
+              size=9, color=SOFT)  # fmt: skip
+    _length(page, (MARGIN, -36), (MARGIN + 100, -36), "100", 1)
+    width = half + axis + r
+    if width > PAGE[0] - 2 * MARGIN or max(2 * half, 2 * r) > PAGE[1] - 80:
+        page.text(MARGIN, -60, "This rig does not fit on A4: measure from page 1.", size=11)
+        return
+    place = _axes(figure, (PAGE[0] - width) / 2 + half, 60 + max(half, r), 1)
+    # Corners only: a line along the sample's border would hide its edge.
+    for sx in (-1, 1):
+        for sy in (-1, 1):
+            place.plot([sx * half, sx * half, sx * (half - 8)],
+                       [sy * (half - 8), sy * half, sy * half], color=SOFT, lw=0.6)  # fmt: skip
+    name = f"sample\n{2 * half:.0f} × {2 * half:.0f} mm"
+    place.text(0, 0, name, ha="center", va="center", size=9, color=SOFT)
+    turn = np.linspace(0, 2 * math.pi, 90)
+    place.plot(axis + 0.9 * r * np.cos(turn), 0.9 * r * np.sin(turn), color=SOFT, lw=0.4)
+    place.plot([axis - 3, axis + 3], [0, 0], color=SOFT, lw=0.4)
+    place.plot([axis, axis], [-3, 3], color=SOFT, lw=0.4)
+    place.text(axis, -half + 2, "ball on\nthe cross", ha="center", va="bottom", size=9, color=SOFT)
+
+
+def _rectangle(
+    axes: Any, x: float, y: float, w: float, h: float, colour: str, **style: Any
+) -> None:
+    axes.plot([x, x + w, x + w, x, x], [y, y, y + h, y + h, y], color=colour, **style)
+
+
+def _length(
+    axes: Any, a: tuple[float, float], b: tuple[float, float], text: str, scale: float
+) -> None:
+    """A dimension line from a to b, its number beside its middle."""
+    axes.annotate("", b, a, arrowprops={"arrowstyle": "<->", "color": SOFT, "lw": 0.7,
+                                        "shrinkA": 0, "shrinkB": 0})  # fmt: skip
+    upright = a[0] == b[0]
+    x, y = (a[0] + b[0]) / 2, (a[1] + b[1]) / 2
+    axes.text(x + (1.2 * scale if upright else 0), y + (0 if upright else 0.8 * scale), text,
+              ha="left" if upright else "center", va="center" if upright else "bottom", size=8,
+              color=SOFT)  # fmt: skip

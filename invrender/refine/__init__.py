@@ -1,0 +1,1 @@
+"""Photo and lights → maps: starts without a network, the prior, and the solvers."""

@@ -1,0 +1,47 @@
+"""Initial maps without a network: a flat sample with the commonest lobe, diffuse from the rest."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from invrender.maps import Maps, constant_maps
+from invrender.render.backend import dr, vector
+from invrender.render.fast.tables import Tables
+from invrender.render.renderer import Unbiased, shade
+from invrender.render.scene import make_view
+from invrender.types import Array
+
+USUAL_ROUGHNESS, USUAL_SPECULAR = 0.55, 0.04  # medians of common materials
+
+
+def flat_maps(photo: Array, prepared: Tables | Unbiased, samples: int = 64) -> Maps:
+    """Maps of a flat sample for a photo (H, W, 3) of it, linear radiance."""
+    height, width = photo.shape[:2]
+    terms = plane_terms(prepared, height, width, USUAL_ROUGHNESS, samples)
+    k_s = np.full(3, USUAL_SPECULAR)
+    maps = constant_maps(height, width, 0.0, k_s, USUAL_ROUGHNESS)
+    maps.diffuse = diffuse_rest(photo, terms, k_s)
+    return maps
+
+
+def diffuse_rest(photo: Array, terms: tuple[Array, Array, Array], k_s: Array) -> Array:
+    """The diffuse albedo that explains what a lobe (E, B, A) of f0 k_s leaves of the photo.
+
+    What a surface mirrors it cannot scatter too: at most 1 - k_s.
+    """
+    e, b, a = terms
+    rest = (photo - k_s * b - a) * np.pi / np.maximum(e, 1e-12)
+    return np.clip(rest, 0, 1 - k_s).astype(np.float32)
+
+
+def plane_terms(
+    prepared: Tables | Unbiased, height: int, width: int, rho: float, samples: int
+) -> tuple[Array, Array, Array]:
+    """E, B and A of I = k_d·E/π + k_s·B + A for a flat sample, each (H, W, 3)."""
+    scalar = prepared.scene.scalar
+    view = make_view(prepared.scene, height, width)
+    shading = shade(prepared, view, dr.opaque(scalar, rho), vector(scalar, 3)(0, 0, 1), samples)
+    parts = shading.irradiance, shading.b, shading.a
+    dr.eval(parts)  # one launch for all
+    e, b, a = (np.asarray(x).T.reshape(height, width, 3) for x in parts)
+    return e, b, a

@@ -1,0 +1,90 @@
+"""What is known of the maps before the photo is fitted, as a Gaussian a pixel.
+
+A pixel's nine parameters are θ = (k_d, k_s, ρ, slopes p and q of n ∝ (p, q, 1)), an image of them
+(H, W, 9).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from invrender.maps import Maps
+from invrender.refine.theta import D, N, R, S, to_theta
+from invrender.types import Array
+
+# By how much errors exceed what the networks expect, in the order of θ, where lights are estimated:
+# benchmarks/refine_calibrate.py, with the weights in the package.
+UNTOLD = np.array([2.05] * 3 + [1.1] * 3 + [1.1] + [1.35] * 2, np.float32)
+
+
+@dataclass
+class Prior:
+    """mean, sigma: (H, W, 9) in the order of θ; correlation: (9, 9), of the deviations.
+
+    total: (H, W, 9), the expected error where ``sigma`` is only what a pixel may move by, without
+    what its whole material shares; None where they are the same.
+    """
+
+    mean: Array
+    sigma: Array
+    correlation: Array
+    total: Array | None = None
+
+
+def lobe_prior(maps: Maps) -> Prior:
+    """The uncertainty within a material of maps from `invrender.refine.lobes`: mostly shade and
+    relief."""
+    mean = to_theta(maps)
+    sigma = np.zeros_like(mean)
+    metal = np.clip((maps.specular - 0.06) / 0.3, 0, 1)
+    sigma[..., D] = 0.01 + 0.05 * maps.diffuse
+    sigma[..., S] = 0.002 + 0.05 * metal
+    sigma[..., R], sigma[..., N] = 0.02, 0.05
+    return Prior(mean, sigma, _correlation(0.98, 0.95))
+
+
+def network_prior(maps: Maps, sigma: dict[str, Array]) -> Prior:
+    """The uncertainty of a network's maps, from what it expects of its errors, (H, W) a map.
+
+    ``sigma`` of normals is that of n/2 + 1/2. An albedo's error within a material is at most a
+    share of it. The total error is `UNTOLD` times what the network expects; a step is made with
+    the same part of each, so that none grows by it.
+    """
+    mean = to_theta(maps)
+    told = np.empty_like(mean)
+    told[..., D], told[..., S] = (sigma[k][..., None] for k in ("diffuse", "specular"))
+    told[..., R] = sigma["roughness"]
+    told[..., N] = 2 * sigma["normal"][..., None]
+    told = np.maximum(told, 1e-4)
+    total = UNTOLD * told
+    spread = total / UNTOLD.max()
+    spread[..., D] = np.minimum(spread[..., D], 0.01 + 0.15 * maps.diffuse)
+    spread[..., S] = np.minimum(spread[..., S], 0.01 + 0.3 * maps.specular)
+    return Prior(mean, spread, _correlation(0.9, 0.95), total)
+
+
+def _correlation(diffuse: float, specular: float) -> Array:
+    """(9, 9): an albedo's channels vary together."""
+    correlation = np.eye(9)
+    for k, r in ((D, diffuse), (S, specular)):
+        correlation[k, k] = r + (1 - r) * np.eye(3)
+    return correlation.astype(np.float32)
+
+
+def pooled(priors: Sequence[Prior]) -> Prior:
+    """What several photos' priors of the same sample tell together: means weighted by precision.
+
+    A network errs on a material in much the same way from every photo, so the expected error does
+    not fall with their number: it is that of the mean precision.
+    """
+    if len(priors) == 1:
+        return priors[0]
+    precision = [1 / p.sigma**2 for p in priors]
+    sum_ = np.sum(precision, 0)
+    mean = np.sum([w * p.mean for w, p in zip(precision, priors, strict=True)], 0) / sum_
+    totals = [p.sigma if p.total is None else p.total for p in priors]
+    total = np.sqrt(len(priors) / np.sum([1 / t**2 for t in totals], 0))
+    return Prior(mean, np.sqrt(len(priors) / sum_), priors[0].correlation, total)

@@ -1,0 +1,1 @@
+"""Lights and maps → radiance and its Jacobian: the forward model."""

@@ -1,0 +1,1 @@
+"""The nearly noise-free estimator: tables of the lights and filtered VNDF samples."""

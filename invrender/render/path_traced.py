@@ -1,0 +1,304 @@
+"""The same rig as a Mitsuba 3 scene: the whole photograph, reference images and the baseline.
+
+Mitsuba's path tracer sees what the estimators leave out: the ball, the table and the light that
+they and the sample exchange. The sample's BSDF is a plugin that calls `invrender.render.brdf`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from invrender.maps import Maps
+from invrender.render import brdf
+from invrender.render.backend import BACKEND, dr
+from invrender.rig import Rig
+from invrender.sphere import mitsuba_rows
+from invrender.types import Array
+
+import mitsuba as mi  # isort: skip  (after the back end has chosen its LLVM)
+
+mi.set_variant(f"{BACKEND}_ad_rgb")
+mi.set_log_level(mi.LogLevel.Error)  # it warns of sample counts that it rounds
+
+SAMPLE_LIFT = 1e-4  # of the screen's size: the table lies that far below the sample
+
+
+class CookTorrance(mi.BSDF):
+    """`invrender.render.brdf` with per-pixel parameters: nearest texel, row 0 at v = 1.
+
+    Parameters: diffuse, specular, normal (H, W, 3), roughness (H, W, 1), as tensors. Reflects
+    nothing when either direction is below the surface or below the shading normal's horizon.
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        mi.BSDF.__init__(self, props)
+        self.maps = {
+            name: mi.TensorXf(props[name])
+            for name in ("diffuse", "specular", "roughness", "normal")
+        }
+        self.m_components = [mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide]
+        self.m_flags = self.m_components[0]
+
+    def traverse(self, cb: mi.TraversalCallback) -> None:
+        for name, tensor in self.maps.items():
+            cb.put(name, tensor, mi.ParamFlags.Differentiable)
+
+    def parameters_changed(self, keys: list[str]) -> None:
+        pass
+
+    def _fetch(self, name: str, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Any:
+        tensor = self.maps[name]
+        h, w, channels = tensor.shape
+        column = mi.UInt32(dr.clip(si.uv.x * w, 0, w - 1))
+        row = mi.UInt32(dr.clip((1 - si.uv.y) * h, 0, h - 1))
+        vector = mi.Float if channels == 1 else mi.Color3f
+        return dr.gather(vector, tensor.array, row * w + column, active)
+
+    def _setup(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[Any, Any, Any, Any]:
+        n = dr.normalize(mi.Vector3f(self._fetch("normal", si, active)))
+        s, t = brdf.frame(n)
+        v = brdf.to_viewer(si.wi, s, t, n)
+        alpha = dr.square(self._fetch("roughness", si, active))
+        return s, t, v, alpha
+
+    def _eval(
+        self, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool
+    ) -> tuple[mi.Color3f, mi.Float]:
+        active &= (si.wi.z > 0) & (wo.z > 0)
+        s, t, v, alpha = self._setup(si, active)
+        l = brdf.to_local(wo, s, t, dr.cross(s, t))
+        value, fresnel = brdf.specular(l, v, alpha)
+        k_d, k_s = self._fetch("diffuse", si, active), self._fetch("specular", si, active)
+        lobe = value * (k_s + (1 - k_s) * fresnel)
+        color = k_d * (dr.maximum(l.z, 0) / dr.pi) + lobe
+        pdf = 0.5 * (dr.maximum(l.z, 0) / dr.pi + brdf.pdf_vndf(l, v, alpha))
+        return color & active, dr.select(active, pdf, 0)
+
+    def sample(
+        self,
+        ctx: mi.BSDFContext,
+        si: mi.SurfaceInteraction3f,
+        sample1: mi.Float,
+        sample2: mi.Point2f,
+        active: mi.Bool = True,
+    ) -> tuple[mi.BSDFSample3f, mi.Color3f]:
+        s, t, v, alpha = self._setup(si, active)
+        h = brdf.sample_vndf(v, alpha, sample2.x, sample2.y)
+        mirror = dr.fma(h, 2 * dr.dot(v, h), -v)
+        cosine = brdf.sample_cosine(sample2.x, sample2.y, mi.Vector3f)
+        l = dr.select(sample1 < 0.5, mirror, cosine)
+        bs = dr.zeros(mi.BSDFSample3f)
+        bs.wo = dr.detach(brdf.to_world(l, s, t, dr.cross(s, t)))
+        value, pdf = self._eval(si, bs.wo, mi.Bool(active))
+        bs.pdf = dr.detach(pdf)
+        bs.eta = 1
+        bs.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
+        bs.sampled_component = 0
+        valid = bs.pdf > 0
+        return bs, dr.select(valid, value / dr.select(valid, bs.pdf, 1), 0)
+
+    def eval(
+        self,
+        ctx: mi.BSDFContext,
+        si: mi.SurfaceInteraction3f,
+        wo: mi.Vector3f,
+        active: mi.Bool = True,
+    ) -> mi.Color3f:
+        return self._eval(si, wo, mi.Bool(active))[0]
+
+    def pdf(
+        self,
+        ctx: mi.BSDFContext,
+        si: mi.SurfaceInteraction3f,
+        wo: mi.Vector3f,
+        active: mi.Bool = True,
+    ) -> mi.Float:
+        return self._eval(si, wo, mi.Bool(active))[1]
+
+    def eval_pdf(
+        self,
+        ctx: mi.BSDFContext,
+        si: mi.SurfaceInteraction3f,
+        wo: mi.Vector3f,
+        active: mi.Bool = True,
+    ) -> tuple[mi.Color3f, mi.Float]:
+        return self._eval(si, wo, mi.Bool(active))
+
+    def to_string(self) -> str:
+        return "CookTorrance[]"
+
+
+mi.register_bsdf("invrender", lambda props: CookTorrance(props))
+
+
+def _transform(columns: list[Array]) -> Any:
+    matrix = np.eye(4)
+    matrix[:3, :4] = np.stack(columns, -1)
+    return mi.ScalarTransform4f(matrix)
+
+
+def _bitmap(image: Array) -> Any:
+    return mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32))
+
+
+def sample_scene(
+    rig: Rig,
+    maps: Maps,
+    pattern: Array | None,
+    environment: Array | None,
+    gain: Any = 1.0,
+    *,
+    max_depth: int = 2,
+    integrator: str = "path",
+) -> mi.Scene:
+    """The sample, the screen and the environment alone: what the estimators integrate.
+
+    The same bilinear pattern and environment, the same pixel-wise constant material.
+    """
+    half = rig.sample_size / 2
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": integrator, "max_depth": max_depth}
+            if integrator != "direct"
+            else {"type": "direct", "emitter_samples": 2, "bsdf_samples": 1},
+            "sample": {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f().scale([half, half, 1]),
+                "bsdf": _bsdf(maps),
+            },
+            **_lights(rig, pattern, environment, gain),
+        }
+    )
+
+
+def _bsdf(maps: Maps) -> dict[str, Any]:
+    return {
+        "type": "invrender",
+        "diffuse": mi.TensorXf(maps.diffuse.astype(np.float32)),
+        "specular": mi.TensorXf(maps.specular.astype(np.float32)),
+        "roughness": mi.TensorXf(maps.roughness[..., None].astype(np.float32)),
+        "normal": mi.TensorXf(maps.normal.astype(np.float32)),
+    }
+
+
+def _lights(
+    rig: Rig, pattern: Array | None, environment: Array | None, gain: Any
+) -> dict[str, Any]:
+    lights: dict[str, Any] = {}
+    if pattern is not None:
+        e_x, e_y = rig.screen_edges
+        down = np.cross(e_y, e_x) / np.linalg.norm(e_x)
+        centre = rig.screen_corner + e_x / 2 + e_y / 2
+        # Mitsuba's rectangle has image row 0 at its -y; turned over, that is the screen's +y.
+        lights["screen"] = {
+            "type": "rectangle",
+            "to_world": _transform([e_x / 2, -e_y / 2, down, centre]),
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}},
+            "emitter": {
+                "type": "area",
+                "radiance": {
+                    "type": "bitmap",
+                    "bitmap": _bitmap(pattern * np.asarray(gain)),
+                    "raw": True,
+                    "wrap_mode": "clamp",
+                    "format": "variant",
+                },
+            },
+        }
+    if environment is not None:
+        lights["environment"] = {
+            "type": "envmap",
+            "bitmap": _bitmap(mitsuba_rows(environment)),
+            "to_world": _transform(
+                [np.array(c, float) for c in ([0, -1, 0], [0, 0, 1], [-1, 0, 0], [0, 0, 0])]
+            ),
+        }
+    return lights
+
+
+def path_traced(
+    scene: mi.Scene, rig: Rig, height: int, width: int, spp: int, seed: int = 0
+) -> Array:
+    """Radiance (H, W, 3) at the sample's pixel centres by the scene's own integrator."""
+    points = rig.sample_points(height, width).reshape(-1, 3)
+    d = points - rig.camera
+    d /= np.linalg.norm(d, axis=-1, keepdims=True)
+    wide = dr.arange(mi.UInt32, len(points) * spp) // spp
+    direction = dr.gather(mi.Vector3f, mi.Float(d.ravel().astype(np.float32)), wide)
+    ray = mi.RayDifferential3f(mi.Ray3f(o=mi.Point3f(*map(float, rig.camera)), d=direction))
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed, len(points) * spp)
+    color, _, _ = scene.integrator().sample(scene, sampler, ray)
+    channels = [dr.block_sum(c, spp) / spp for c in color]
+    return np.stack([np.array(c) for c in channels], -1).reshape(height, width, 3)
+
+
+def photograph(
+    rig: Rig,
+    maps: Maps,
+    pattern: Array,
+    environment: Array,
+    gain: Any = 1.0,
+    *,
+    height: int = 960,
+    width: int = 1280,
+    spp: int = 64,
+    max_depth: int = 4,
+    table: Any = 0.3,
+    seed: int = 0,
+) -> Array:
+    """The whole photo (H, W, 3), linear: sample, mirror ball, diffuse table, light between them."""
+    half, size = rig.sample_size / 2, rig.screen_size
+    camera, (right, up, back) = rig.camera, rig.camera_axes
+    table = np.broadcast_to(np.asarray(table, dtype=float), 3)
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "path", "max_depth": max_depth},
+            "sensor": {
+                "type": "perspective",
+                "fov": rig.fov,
+                "fov_axis": "x",
+                "near_clip": 1e-3 * size,
+                "far_clip": 1e3 * size,
+                # Mitsuba's camera looks along its z and has its x to the left.
+                "to_world": _transform([-right, up, -back, camera]),
+                "film": {
+                    "type": "hdrfilm",
+                    "width": width,
+                    "height": height,
+                    "rfilter": {"type": "box"},
+                    "pixel_format": "rgb",
+                    "component_format": "float32",
+                },
+                "sampler": {"type": "multijitter", "sample_count": spp},
+            },
+            "sample": {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f().scale([half, half, 1]),
+                "bsdf": _bsdf(maps),
+            },
+            "table": {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f()
+                .translate([0, 0, -SAMPLE_LIFT * size])
+                .scale([100 * size, 100 * size, 1]),
+                "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(table)}},
+            },
+            "ball": {
+                "type": "sphere",
+                "center": list(map(float, rig.ball_centre)),
+                "radius": rig.ball_radius,
+                "bsdf": {
+                    "type": "conductor",
+                    "material": "none",
+                    "specular_reflectance": {"type": "rgb", "value": list(rig.ball_reflectance)},
+                },
+            },
+            **_lights(rig, pattern, environment, gain),
+        }
+    )
+    return np.array(mi.render(scene, spp=spp, seed=seed))

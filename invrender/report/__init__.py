@@ -1,0 +1,1 @@
+"""What a person sees of a result: the page with its live viewer, pictures and numbers."""

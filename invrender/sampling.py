@@ -1,0 +1,67 @@
+"""Resampling of images: area means to fewer pixels, bilinear to more."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from invrender.types import Array
+
+
+def resize(image: Array, height: int, width: int) -> Array:
+    """Resize (H, W) or (H, W, C): the mean over each new pixel's area, linear when enlarging."""
+    result = np.asarray(image, np.float32)
+    for axis, size in enumerate((height, width)):
+        if result.shape[axis] != size:
+            moved = np.ascontiguousarray(np.swapaxes(result, 0, axis))
+            new = _weights(moved.shape[0], size) @ moved.reshape(moved.shape[0], -1)
+            result = np.swapaxes(new.reshape(size, *moved.shape[1:]), 0, axis)
+    return np.ascontiguousarray(result)
+
+
+def _weights(old: int, new: int) -> csr_array:
+    """Weights (new, old) of old pixels in new ones. Sparse: no BLAS threads to fight others'."""
+    edges = np.linspace(0, old, new + 1)
+    if new <= old:
+        first = np.floor(edges[:-1]).astype(np.intp)
+        column = first[:, None] + np.arange(int(np.ceil(old / new)) + 1)
+        overlap = np.minimum(edges[1:, None], column + 1) - np.maximum(edges[:-1, None], column)
+        weight = np.maximum(overlap, 0) / (old / new)
+        column = np.minimum(column, old - 1)
+    else:
+        centre = np.clip((edges[:-1] + edges[1:]) / 2 - 0.5, 0, old - 1)
+        first = np.minimum(centre.astype(np.intp), max(old - 2, 0))
+        column = np.minimum(first[:, None] + np.arange(2), old - 1)
+        weight = np.stack([1 - (centre - first), centre - first], -1)
+    start = np.arange(new + 1) * column.shape[1]
+    values = weight.astype(np.float32).ravel()
+    return csr_array((values, column.ravel(), start), shape=(new, old))
+
+
+def resize_pattern(pattern: NDArray[Any], size: int) -> NDArray[np.float32]:
+    """A square pattern (P, P, 3) at (size, size, 3): bilinear to more pixels, means over the new
+    pixels' areas to fewer."""
+    weights = _resampling(len(pattern), size)
+    out = np.einsum("ir,jc,rcd->ijd", weights, weights, pattern, optimize=True)
+    return np.clip(out, 0, 1).astype(np.float32)
+
+
+@cache
+def _resampling(old: int, new: int) -> NDArray[np.float64]:
+    """Rows of weights (new, old) along one axis; the border is repeated."""
+    weights = np.zeros((new, old))
+    if new <= old:  # overlaps of the new pixels with the old ones
+        edges = np.arange(new + 1) * (old / new)
+        cells = np.arange(old)
+        overlap = np.minimum(edges[1:, None], cells + 1) - np.maximum(edges[:-1, None], cells)
+        return np.asarray(np.maximum(overlap, 0) * (new / old))
+    place = np.clip((np.arange(new) + 0.5) * old / new - 0.5, 0, old - 1)
+    left = np.minimum(place.astype(int), max(old - 2, 0))
+    right = np.minimum(left + 1, old - 1)
+    np.add.at(weights, (np.arange(new), left), 1 - (place - left))
+    np.add.at(weights, (np.arange(new), right), place - left)
+    return weights

@@ -1,0 +1,1 @@
+"""Training: captures drawn and stored, batches, losses, runs, calibration."""

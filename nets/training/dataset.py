@@ -1,0 +1,240 @@
+"""Training captures: (material, room, rig, noise) → what the network sees and should answer.
+
+    python -m nets.training.dataset --out DIR --count 4096 --materials DIR --envs DIR
+
+Shards of `SHARD` captures are files shard_NNNNNN.safetensors. Shard i depends on the options, the
+seed and i alone, and appears under its name only when whole: the same command again makes what is
+missing. ``--scheduler`` runs it on a Dask cluster whose machines share the folders.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from collections.abc import Iterator
+from dataclasses import asdict
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors.numpy import save_file
+
+from invrender.data.environments import find_environments
+from invrender.data.materials import find_materials
+from invrender.maps import Maps
+from invrender.refine.lobes import lobe_terms, read_lobes
+from invrender.render.backend import dr
+from invrender.render.fast.tables import Tables
+from invrender.render.renderer import Unbiased, material_from_maps, prepare, radiance
+from invrender.render.scene import make_scene, make_view
+from invrender.sphere import scale_environment
+from invrender.tasks import map_tasks
+from invrender.types import Array, InputError
+from nets.batch import lobe_inputs, positions
+from nets.clues import light_inputs, white_level
+from nets.predict import estimate_of, linearised, predict
+from nets.store import load_weights
+from nets.training.draw import (
+    SPLITS,
+    Options,
+    draw_environment,
+    draw_material,
+    draw_rigs,
+    light_pattern,
+)
+from nets.training.noise import (
+    capture_pattern,
+    captured_environment,
+    display,
+    draw_pattern,
+    fit_gain,
+    sensor,
+)
+from nets.training.sheet import problems
+
+Sample = dict[str, Array]
+
+SHARD = 64
+RADIANCE = ("photo", "ideal", "env_clues", "active_clues", "sky", "screen", "ball", "pattern")
+FLOOR = 1e-4  # smallest white level of a usable capture, of the screen's white
+
+
+def make_group(rng: np.random.Generator, options: Options) -> list[Sample]:
+    """``per_room`` captures in one room with one rig. Fewer if some come out degenerate."""
+    known, true = draw_rigs(rng)
+    pattern = draw_pattern(rng, light_pattern(options.pattern))
+    shown = display(rng, pattern)
+    # Irradiance of the room relative to the screen's, from a dark room to a bright one.
+    ratio = np.exp(rng.uniform(np.log(0.05), np.log(6.0)))
+    level = float(shown.mean()) * 0.7 * ratio  # π times the screen's form factor is about 0.7
+    env = scale_environment(draw_environment(rng, options), level)
+    gain = fit_gain(shown, pattern, rng)
+    captured = capture_pattern(rng, shown)
+    seen = captured_environment(rng, env, float(shown.max()))
+    lights = light_inputs(known, pattern, gain, seen, captured)
+    unit = white_level(lights)
+    if not unit > FLOOR:
+        return []
+
+    size = options.size
+    # Light adds up: the room beside a dark screen, and the screen alone as it is and should be.
+    room = prepare(make_scene(true, np.ones_like(pattern), env, gain=0.0))
+    screens = [prepare(make_scene(true, p, None, g)) for p, g in ((shown, 1.0), (pattern, gain))]
+    known_lights = prepare(make_scene(known, pattern, seen, gain))
+    terms = lobe_terms(known_lights, size, size, options.samples)
+    out = []
+    for _ in range(options.per_room):
+        maps = draw_material(rng, options)
+        material = material_from_maps(maps, whole=True)
+        view = make_view(room.scene, size, size, seed=int(rng.integers(2**31)))
+        parts = [radiance(p, view, material, options.samples) for p in (room, *screens)]
+        dr.eval(parts)
+        a, b, c = (np.asarray(p).T.reshape(size, size, 3) for p in parts)
+        photo = sensor(rng, a + b)
+        sample = {"photo": photo, "ideal": a + c, **lights}
+        if all(np.isfinite(v).all() for v in sample.values()):
+            packed = _pack(sample, unit, maps)
+            if problems(packed):
+                continue
+            lobes = read_lobes(photo, known_lights, options.samples, terms)
+            packed |= {k: v.astype(np.float16) for k, v in lobe_inputs(lobes).items()}
+            if options.network:
+                packed = _for_correction(packed, unit, known_lights, lobes.maps, options)
+            out.append(packed)
+    return out
+
+
+def _for_correction(
+    sample: Sample, unit: float, prepared: Tables | Unbiased, lobes: Maps, options: Options
+) -> Sample:
+    """What a network makes of a capture, as the correction sees it."""
+    batch = {
+        k: torch.from_numpy(v.astype(np.float32))[None] for k, v in sample.items() if k != "maps"
+    }
+    batch["position"] = positions(options.size, options.size)[None]
+    found = estimate_of(predict(network_cached(options.network), batch), unit)
+    photo = np.moveaxis(sample["photo"].astype(np.float32), 0, -1) * unit
+    clipped = (photo >= 0.999 * photo.max()).any(-1)
+    seen = linearised(photo, prepared, found, lobes, clipped, options.samples)
+    out = {k: np.clip(v, -6e4, 6e4).astype(np.float16) for k, v in seen.items() if k != "position"}
+    return {**out, "maps": sample["maps"]}
+
+
+@lru_cache(maxsize=1)
+def network_cached(path: str) -> torch.nn.Module:
+    return load_weights(Path(path))[0]
+
+
+def _pack(sample: Sample, unit: float, maps: Maps) -> Sample:
+    """Radiance in units of a white plane as float16, maps as bytes, all channels first."""
+    sample["photo"] = np.moveaxis(sample["photo"], -1, 0)
+    sample["ideal"] = np.moveaxis(sample["ideal"], -1, 0)
+    out = {k: np.clip(sample[k] / unit, 0, 6e4).astype(np.float16) for k in RADIANCE}
+    out["slope_clues"] = np.clip(sample["slope_clues"] / unit, -6e4, 6e4).astype(np.float16)
+    out["rig"] = sample["rig"].astype(np.float32)
+    normal = maps.normal[..., :2] / 2 + 0.5
+    stacked = [normal, maps.diffuse, maps.roughness[..., None], maps.specular]
+    values = np.clip(np.concatenate(stacked, -1), 0, 1)
+    out["maps"] = np.moveaxis(np.round(values * 255).astype(np.uint8), -1, 0)
+    return {k: np.ascontiguousarray(v) for k, v in out.items()}
+
+
+def captures(options: Options, index: int) -> Iterator[Sample]:
+    """The endless stream of captures that shard ``index`` is cut from."""
+    rng = np.random.default_rng([options.seed, index, SPLITS.index(options.split)])
+    while True:
+        yield from make_group(rng, options)
+
+
+def shard_path(folder: Path, index: int) -> Path:
+    return Path(folder) / f"shard_{index:06d}.safetensors"
+
+
+def write_shard(folder: Path, index: int, options: Options, count: int = SHARD) -> Path:
+    """Write shard ``index`` unless it is there. The work of any engine that maps over indices."""
+    path = shard_path(folder, index)
+    if path.exists():
+        return path
+    stream = captures(options, index)
+    samples = [next(stream) for _ in range(count)]
+    tensors = {k: np.stack([s[k] for s in samples]) for k in samples[0]}
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    save_file(tensors, part, metadata={"options": json.dumps(asdict(options)), "index": str(index)})
+    part.replace(path)
+    return path
+
+
+# --- command line ---------------------------------------------------------------------------------
+
+
+def _work(job: tuple[Path, int, Options, int]) -> tuple[int, float]:
+    """Write a shard on one thread: (its index, seconds)."""
+    _single_thread()
+    start = time.perf_counter()
+    write_shard(*job)
+    return job[1], time.perf_counter() - start
+
+
+def _single_thread() -> None:
+    dr.set_thread_count(1)
+    torch.set_num_threads(1)
+
+
+def check_options(options: Options) -> None:
+    """Raise `InputError` for what no worker could use, before any starts."""
+    if min(options.size, options.samples, options.per_room) < 1 or options.env_height < 2:
+        raise InputError("sizes, samples and captures a room must be positive")
+    if not 0 <= options.procedural <= 1:
+        raise InputError("--procedural is a share between 0 and 1")
+    light_pattern(options.pattern)
+    if options.network:
+        network_cached(options.network)
+    if options.materials:
+        find_materials(Path(options.materials))
+    if options.envs:
+        find_environments(Path(options.envs))
+
+
+def main() -> int:
+    """Write what is missing; 1 where a shard failed, 2 for bad input."""
+    parser = argparse.ArgumentParser(prog="python -m nets.training.dataset", description=__doc__)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--count", type=int, default=4096, help="captures")
+    parser.add_argument("--first", type=int, default=0, help="index of the first shard")
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes")
+    parser.add_argument("--scheduler", help="address of a Dask scheduler, instead of processes")
+    for name, value in asdict(Options()).items():
+        kind = {"choices": SPLITS} if name == "split" else {"type": type(value)}
+        parser.add_argument(f"--{name.replace('_', '-')}", default=value, **kind)
+    args = parser.parse_args()
+    options = Options(**{k: getattr(args, k) for k in asdict(Options())})
+    failed = 0
+    try:
+        check_options(options)
+        args.out.mkdir(parents=True, exist_ok=True)
+        counts = [min(SHARD, args.count - i) for i in range(0, args.count, SHARD)]
+        jobs = [(args.out.resolve(), args.first + i, options, n) for i, n in enumerate(counts)]
+        jobs = [job for job in jobs if not shard_path(*job[:2]).exists()]
+        start, made = time.perf_counter(), 0
+        for done in map_tasks(_work, jobs, args.scheduler, args.workers):
+            if done.error is not None:
+                failed += 1
+                print(f"shard {jobs[done.index][1]} failed: {done.error}\n{done.trace}", flush=True)
+                continue
+            index, seconds = done.result
+            made += jobs[done.index][3]
+            rate = made / (time.perf_counter() - start)
+            print(f"shard {index}: {seconds:.1f} s; {rate:.2f} captures/s in all", flush=True)
+    except InputError as e:
+        print(f"error: {e}")
+        return 2
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    from nets.training import dataset as data
+
+    raise SystemExit(data.main())

@@ -1,0 +1,79 @@
+"""What lies between the light that is meant and what a photo and its mirror ball show of it.
+
+On the screen: intensity, display curve, white balance. On the pattern and the room as the ball
+shows them: mosaic, eroded borders, clipped lamps. On the photo: blur, noise, clipping.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import gaussian_filter, zoom
+
+from invrender.sphere import resample_environment
+from invrender.types import Array
+from nets.splitsum import area_resize
+
+
+def draw_pattern(rng: np.random.Generator, pattern: Array) -> Array:
+    """The pattern as a screen shows it whose curve and white balance the ball told us."""
+    if rng.random() < 0.6:
+        return pattern
+    curve = 2.2 ** rng.uniform(-1, 1)
+    return (pattern**curve * np.exp(np.log(1.25) * rng.uniform(-1, 1, 3))).astype(np.float32)
+
+
+def display(rng: np.random.Generator, pattern: Array) -> Array:
+    """What a real screen shows of a pattern: intensity, display curve, white balance."""
+    shown = pattern * np.exp(0.3 * rng.standard_normal())
+    if rng.random() < 0.7:
+        shown = np.clip(shown, 0, None) ** np.exp(0.08 * rng.standard_normal())
+        shown = shown * np.exp(0.06 * rng.standard_normal(3))
+        shown = shown + rng.uniform(0, 0.01) * shown.max()  # black is never black
+    return shown.astype(np.float32)
+
+
+def fit_gain(shown: Array, pattern: Array, rng: np.random.Generator) -> Array:
+    """The RGB gain that a user's software finds for what the screen shows: a little off, and more
+    so at times, as from a small JPEG."""
+    gain = (shown * pattern).sum((0, 1)) / np.maximum((pattern**2).sum((0, 1)), 1e-9)
+    error = 0.01 if rng.random() < 0.65 else 0.06
+    return gain * np.exp(error * (rng.standard_normal(3) + rng.standard_normal()))
+
+
+def capture_pattern(rng: np.random.Generator, shown: Array) -> Array:
+    """What the ball shows of the screen: a mosaic with eroded borders."""
+    n = int(rng.integers(16, 64))
+    small = area_resize(shown, n)
+    if rng.random() < 0.5:
+        border = np.ones((n, n, 1), np.float32)
+        border[0] *= rng.uniform(0, 1)
+        border[-1] *= rng.uniform(0, 1)
+        border[:, 0] *= rng.uniform(0, 1)
+        border[:, -1] *= rng.uniform(0, 1)
+        small = small * border
+    small = small * np.exp(0.02 * rng.standard_normal(small.shape))
+    return np.asarray(zoom(small, (64 / n, 64 / n, 1), order=0, grid_mode=True, mode="nearest"))
+
+
+def captured_environment(rng: np.random.Generator, env: Array, white: float) -> Array:
+    """What the ball shows of the room: coarser, at times clipped, a little off in colour."""
+    height = int(rng.choice([32, 48, 64]))
+    seen = resample_environment(env, height)
+    if rng.random() < 0.3:  # lamps brighter than the photo's white
+        seen = np.minimum(seen, white * np.exp(rng.uniform(np.log(2), np.log(50))))
+    error = 0.03 if rng.random() < 0.65 else 0.15
+    seen = seen * np.exp(0.02 * rng.standard_normal(3)) * np.exp(error * rng.standard_normal())
+    return resample_environment(seen.astype(np.float32), 64)
+
+
+def sensor(rng: np.random.Generator, image: Array) -> Array:
+    """A camera's noise, blur and clipping on radiance (H, W, 3)."""
+    if rng.random() < 0.5:
+        image = gaussian_filter(image, (s := rng.uniform(0.2, 0.8), s, 0))
+    top = np.percentile(image, 99.5) * np.exp(rng.uniform(np.log(0.8), np.log(8)))
+    top = max(float(top), 1e-8)
+    electrons = np.exp(rng.uniform(np.log(1500), np.log(60000)))
+    read = np.exp(rng.uniform(np.log(2e-4), np.log(2e-3)))
+    x = np.clip(image / top, 0, None)
+    x = x + np.sqrt(x / electrons + read**2) * rng.standard_normal(image.shape)
+    return (np.clip(x, 0, 1) * top).astype(np.float32)

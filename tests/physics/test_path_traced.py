@@ -1,0 +1,60 @@
+import numpy as np
+import pytest
+from forward_scenes import some_environment, some_maps, some_pattern
+
+from invrender.maps import constant_maps
+from invrender.render import path_traced as photograph
+from invrender.render import renderer as render
+from invrender.rig import Rig
+
+
+def sample_region(rig, photo, n):
+    """The photo's pixels that show the sample, averaged to n × n."""
+    height, width = photo.shape[:2]
+    half = rig.sample_size / 2
+    corners = rig.project(np.array([[-half, half, 0.0], [half, -half, 0.0]]), height, width)
+    (x0, y0), (x1, _) = np.rint(corners).astype(int)
+    k = (x1 - x0) // n
+    crop = photo[y0 : y0 + n * k, x0 : x0 + n * k]
+    return crop.reshape(n, k, n, k, 3).mean((1, 3))
+
+
+def test_whole_photograph_agrees_on_the_sample():
+    """Without table and ball in the light path (depth 2, black table) the sample is ours."""
+    # A width at which the sample covers whole pixels: 8 per map texel.
+    rig = Rig()
+    n = 16
+    maps, pattern, env = some_maps(n, "glossy"), some_pattern(), some_environment(sun=0)
+    width = 4 * 8 * n
+    fov = np.degrees(2 * np.arctan(0.5 * width * rig.sample_size / (8 * n) / rig.screen_height))
+    rig = Rig(fov=float(fov))
+    photo = photograph.photograph(
+        rig, maps, pattern, env, 3.0, height=width // 2, width=width, spp=32, max_depth=2, table=0.0
+    )
+    ours = render.render(rig, maps, pattern, env, 3.0, samples=256)
+    seen = sample_region(rig, photo, n)
+    difference = np.abs(seen - ours).mean() / ours.mean()
+    assert difference < 0.02, difference
+
+
+def test_ball_and_table_are_where_the_rig_says():
+    """The photo's centre shows the mirror ball; beside it lies the table."""
+    rig = Rig()
+    env = np.full((16, 32, 3), 1.0)
+    photo = photograph.photograph(
+        rig, constant_maps(8, 8), np.ones((4, 4, 3)), env, 2.0, height=240, width=320, spp=16
+    )
+    assert np.all(np.isfinite(photo))
+    # The ball's apex looks back at the camera: the reflected environment beside the screen.
+    assert photo[120, 160] == pytest.approx([0.9] * 3, rel=0.05)
+
+
+def test_table_and_ball_only_add_light():
+    """What the estimators leave out is positive and small: light by way of table and ball."""
+    rig = Rig()
+    maps, pattern, env = some_maps(8, "rough"), some_pattern(), some_environment(sun=0, lamps=0)
+    kw = {"height": 240, "width": 320, "spp": 64}
+    direct = photograph.photograph(rig, maps, pattern, env, max_depth=2, table=0.0, **kw)
+    whole = photograph.photograph(rig, maps, pattern, env, max_depth=5, table=0.3, **kw)
+    a, b = sample_region(rig, direct, 8).mean(), sample_region(rig, whole, 8).mean()
+    assert 0.97 < b / a < 1.1, b / a

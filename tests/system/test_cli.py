@@ -1,0 +1,183 @@
+"""The command line: the whole job on the bundled capture, and what bad input gets."""
+
+import json
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from invrender.cli.main import EXAMPLE, main
+from invrender.files.images import read_image, write_exr
+from invrender.files.maps import read_maps
+from invrender.maps import NAMES
+
+
+@pytest.fixture
+def capture(tmp_path):
+    return shutil.copytree(EXAMPLE, tmp_path / "capture")
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory):
+    out = tmp_path_factory.mktemp("result") / "out"
+    command = ["refine", "example", "-o", str(out), "--size", "96", "--init", "flat", "--quiet"]
+    assert main(command) == 0
+    return out
+
+
+def test_network_starts_nearer(result, tmp_path):
+    """The network's maps are nearer the truth than a flat sample's and its refinement's."""
+    out = tmp_path / "out"
+    assert main(["refine", "example", "-o", str(out), "--size", "96", "--quiet"]) == 0
+    flat, network = (
+        json.loads((folder / "report.json").read_text())["map_error"] for folder in (result, out)
+    )
+    assert network["initial"]["average"] < 0.8 * flat["refined"]["average"]
+    assert network["refined"]["average"] < 0.8 * flat["refined"]["average"]
+
+
+def test_result_is_complete(result):
+    names = {f"{n}.{e}" for n in NAMES for e in ("exr", "png")}
+    names |= {f"sigma_{n}.exr" for n in NAMES}
+    names |= {"environment.exr", "pattern.exr", "report.json", "report.html"}
+    names |= {"photo.png", "render.png", "difference.png"}
+    assert {p.name for p in result.iterdir()} == names
+    assert read_maps(result).shape == (96, 96)
+
+
+def test_report_tells_what_was_gained(result):
+    report = json.loads((result / "report.json").read_text())
+    assert report["photo_error"]["refined"] < 0.5 * report["photo_error"]["initial"]
+    errors = report["map_error"]
+    assert errors["refined"]["average"] < 0.8 * errors["initial"]["average"]
+    assert {"ball", "lights", "refine", "render"} <= report["seconds"].keys()
+
+
+def test_without_torch(tmp_path):
+    """``--init flat`` needs no network library."""
+    code = (
+        "import sys\n"
+        "class Block:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.split('.')[0] in ('torch', 'kornia', 'nets'):\n"
+        "            raise ImportError(name)\n"
+        "sys.meta_path.insert(0, Block())\n"
+        "from invrender.cli import main\n"
+        f"sys.exit(main(['refine', 'example', '-o', {str(tmp_path / 'out')!r}, '--size', '16',"
+        " '--init', 'flat']))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_module_is_a_command(tmp_path):
+    command = [sys.executable, "-m", "invrender.refine", "--help"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0
+    assert "mirror ball" in done.stdout
+
+
+def rig(text):
+    def change(folder):
+        (folder / "rig.toml").write_text(text)
+
+    return change
+
+
+def edit(old, new):
+    def change(folder):
+        path = folder / "rig.toml"
+        text = path.read_text()
+        assert old in text
+        path.write_text(text.replace(old, new))
+
+    return change
+
+
+def photo(f):
+    def change(folder):
+        import OpenEXR
+
+        image = f(read_image(folder / "photo.exr"))
+        with OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION}, {"RGB": image}) as file:
+            file.write(str(folder / "photo.exr"))
+
+    return change
+
+
+def with_nan(image):
+    image[5, 5] = np.nan
+    return image
+
+
+def without_ball(image):
+    h, w = image.shape[:2]
+    image[h // 2 - 60 : h // 2 + 60, w // 2 - 60 : w // 2 + 60] = image[10, 10]
+    return image
+
+
+BAD = {
+    "no photo": (lambda f: (f / "photo.exr").unlink(), "no photo"),
+    "no rig": (lambda f: (f / "rig.toml").unlink(), "rig.toml"),
+    "no pattern": (lambda f: (f / "pattern.exr").unlink(), "pattern.exr"),
+    "not an image": (lambda f: (f / "photo.exr").write_text("hello"), "readable"),
+    "truncated": (
+        lambda f: (f / "photo.exr").write_bytes((f / "photo.exr").read_bytes()[:5000]),
+        "readable",
+    ),
+    "NaN": (photo(with_nan), "NaN"),
+    "black": (photo(np.zeros_like), "black"),
+    "one pixel": (photo(lambda x: x[:1, :1].copy()), "small"),
+    "no ball": (photo(without_ball), "ball"),
+    "ball cut off": (photo(lambda x: x[: x.shape[0] // 2].copy()), ""),
+    "negative size": (edit("size = 0.18", "size = -0.18"), "positive"),
+    "below the table": (edit("height = 0.153", "height = -0.1"), "above"),
+    "unknown key": (edit("size = 0.18", "size = 0.18\ncolour = 3"), "colour"),
+    "not TOML": (rig("screen = {"), "TOML"),
+    "no size": (edit("size = 0.18", ""), "size"),
+    "pattern outside": (edit("pattern.exr", "../pattern.exr"), "folder"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_input(name, capture, tmp_path, capsys):
+    change, words = BAD[name]
+    change(capture)
+    out = tmp_path / "out"
+    before = sorted(p.name for p in tmp_path.iterdir())
+    assert main(["refine", str(capture), "-o", str(out)]) == 2
+    message = " ".join(capsys.readouterr().err.split())
+    assert message.startswith("invrender: ") and words in message
+    assert "Traceback" not in message
+    assert sorted(p.name for p in tmp_path.iterdir()) == before
+
+
+def test_bad_arguments(capture, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(["refine", str(tmp_path / "none"), "-o", str(out)]) == 2
+    assert main(["refine", str(capture), "-o", str(out), "--size", "0"]) == 2
+    with pytest.raises(SystemExit) as stop:
+        main(["refine", str(capture), "-o", str(out), "--ball", "1,2"])
+    assert stop.value.code == 2
+    assert not out.exists()
+
+
+def test_simulate_writes_what_refine_reads(tmp_path, capsys):
+    folder = tmp_path / "new"
+    command = ["simulate", "-o", str(folder), "--kind", "plastic", "--size", "64"]
+    assert main([*command, "--width", "320", "--spp", "4"]) == 0
+    assert {p.name for p in folder.iterdir()} == {"photo.exr", "pattern.exr", "rig.toml", "truth"}
+    assert read_maps(folder / "truth").shape == (64, 64)
+    assert main([*command, "--width", "320", "--spp", "4"]) == 2  # not over what exists
+    assert "not empty" in capsys.readouterr().err
+    assert main(["simulate", "-o", str(tmp_path / "x"), "--kind", "cheese"]) == 2
+    assert not (tmp_path / "x").exists()
+
+
+def test_writing_is_whole_or_nothing(tmp_path):
+    path = tmp_path / "a.exr"
+    with pytest.raises(ValueError, match="non-finite"):
+        write_exr(path, np.full((2, 2), np.nan))
+    assert not list(tmp_path.iterdir())

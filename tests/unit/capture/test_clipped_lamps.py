@@ -1,0 +1,145 @@
+"""Lamps that are clipped, or hidden by the screen, are as bright as the table's shading says."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import ndimage
+from synthetic_photo import blocks, grey_table, light_from, photograph, sky, textured_table
+
+from invrender.capture.ball_image import screen_coordinates
+from invrender.capture.clipped_lamps import raise_clipped
+from invrender.capture.environment import fill_environment, unfold_environment
+from invrender.capture.hidden_lamp import add_hidden_lamp
+from invrender.capture.mirror import make_ball
+from invrender.capture.table import hidden_by_screen, room_irradiance
+from invrender.files.images import Photo
+from invrender.rig import Rig
+from invrender.sphere import directions, irradiance, solid_angles
+
+RIG, SIZE = Rig(), (480, 640)
+BALL = make_ball(RIG, RIG.ball_centre, RIG.ball_radius, SIZE)
+PATTERN, GAIN = blocks(), np.array([0.8, 0.85, 0.75])
+TILTED = [(0.6, 0, 0.8), (-0.6, 0, 0.8), (0, 0.6, 0.8), (0, -0.6, 0.8)]
+LEVEL = 0.95
+
+
+def plain_table(point):
+    """One grey, unlike `grey_table`, whose colours change smoothly as light does."""
+    return np.full(point.shape, 0.3)
+
+
+def room(d):
+    """Below the clipping level but for two lamps."""
+    return 1.2 * sky(d)
+
+
+def hidden_lamp(d):
+    """A dim room with a lamp that the screen hides from the ball but not from the table."""
+    to_lamp = np.array([-0.3, 0.55, 1.0])
+    near = d @ (to_lamp / np.linalg.norm(to_lamp))
+    return 0.3 * sky(d) + 100 * np.exp((near - 1) / 0.004)[..., None] * np.array([1.0, 0.9, 0.7])
+
+
+@pytest.fixture(scope="module")
+def light():
+    return table_light(room)
+
+
+def table_light(room):
+    """Irradiance (25, 33, 3) of the table within 0.15 m of the sample, by brute force."""
+    d = directions(64, 128)[:32].reshape(-1, 3).astype(float)
+    weight = np.repeat(solid_angles(64, 128)[:32], 128) * d[:, 2]
+    out = np.empty((25, 33, 3))
+    for i, y in enumerate(np.linspace(-0.15, 0.15, 25)):
+        for j, x in enumerate(np.linspace(-0.2, 0.2, 33)):
+            out[i, j] = weight @ light_from(RIG, np.array([x, y, 0]), d, room, PATTERN, GAIN)
+    return out
+
+
+def picture(light, albedo, room=room):
+    """The photo with a Lambertian table, clipped, and what the ball shows of the room."""
+
+    def table(point):
+        at = [(point[..., 1] + 0.15) / 0.3 * 24, (point[..., 0] + 0.2) / 0.4 * 32]
+        planes = [
+            ndimage.map_coordinates(light[..., c], at, order=1, mode="nearest") for c in range(3)
+        ]
+        return albedo(point) * np.stack(planes, -1) / np.pi
+
+    image = photograph(RIG, *SIZE, room, table, PATTERN, GAIN)
+    photo = Photo(np.minimum(image, 1).astype(np.float32), LEVEL)
+    return photo, *unfold_environment(photo, RIG, BALL, 64)
+
+
+@pytest.mark.parametrize("albedo", [plain_table, textured_table])
+def test_the_table_tells_how_bright_clipped_lamps_are(light, albedo):
+    photo, environment, coverage = picture(light, albedo)
+    truth = room(directions(256, 512).astype(float))
+    raised, factor = raise_clipped(photo, RIG, BALL, PATTERN, GAIN, environment, coverage)
+
+    def error(seen):
+        seen = fill_environment(seen, coverage)
+        each = [[irradiance(e, n) for n in [(0, 0, 1), *TILTED]] for e in (seen, truth)]
+        return np.abs(np.subtract(*each)).mean() / np.mean(each[1])
+
+    assert error(environment) > 0.15 and factor > 1.5
+    assert error(raised) < 0.4 * error(environment)
+    assert (raised >= environment - 1e-6).all()
+    dark = environment.max(-1) < 0.7
+    assert (raised == environment)[dark].mean() > 0.99  # all but those beside a lamp
+
+
+def test_nothing_clipped_nothing_raised(light):
+    photo, environment, coverage = picture(light, grey_table)
+    for whole in (replace(photo, clip_level=None), replace(photo, clip_level=2.0)):
+        found = raise_clipped(whole, RIG, BALL, PATTERN, GAIN, environment, coverage)
+        assert found[0] is environment and found[1] == 1
+
+
+def test_the_table_tells_of_a_lamp_behind_the_screen():
+    photo, environment, coverage = picture(table_light(hidden_lamp), plain_table, hidden_lamp)
+    photo = replace(photo, clip_level=None)
+    filled = fill_environment(environment, coverage)
+    found, times = add_hidden_lamp(photo, RIG, BALL, PATTERN, GAIN, filled, coverage)
+    assert times > 20
+    np.testing.assert_array_equal(found[coverage > 0], environment[coverage > 0])
+    truth = hidden_lamp(directions(64, 128).astype(float))
+    truth[32:] = 0
+    points = RIG.sample_points(3, 3).reshape(-1, 3)
+    dim, new, true = (room_irradiance(RIG, points, e) for e in (filled, found, truth))
+    assert np.abs(dim - true).mean() > 0.5 * true.mean()
+    assert np.abs(new - true).mean() < 0.3 * np.abs(dim - true).mean()
+
+
+@pytest.mark.parametrize("albedo", [plain_table, grey_table, textured_table])
+def test_no_lamp_behind_the_screen_where_there_is_none(light, albedo):
+    """Nor in a JPEG, nor where the table is black."""
+    photo, environment, coverage = picture(light, albedo)
+    filled = fill_environment(environment, coverage)
+    whole = replace(photo, clip_level=None)
+    for some in (whole, photo, replace(whole, image=0 * photo.image)):
+        found, times = add_hidden_lamp(some, RIG, BALL, PATTERN, GAIN, filled, coverage)
+        assert found is filled and times == 1
+
+
+@pytest.mark.parametrize("table", [0.0, 1e-6, 0.94, 1.0])
+def test_a_table_that_says_nothing_leaves_the_prior(table, light):
+    """Black, nearly so, or saturated itself: the factor stays finite and moderate."""
+    photo, environment, coverage = picture(light, grey_table)
+    image = photo.image.copy()
+    image[:, :250] = image[:, 390:] = table
+    image[:180] = image[300:] = table
+    bad = replace(photo, image=image)
+    raised, factor = raise_clipped(bad, RIG, BALL, PATTERN, GAIN, environment, coverage)
+    assert np.isfinite(raised).all() and 1 <= factor < 500
+
+
+def test_hidden_directions_are_those_that_hit_the_screen():
+    rig = replace(RIG, screen_tilt=(2.0, 3.0, 10.0))
+    d = directions(32, 64).reshape(-1, 3).astype(float)
+    points = np.random.default_rng(1).uniform(-0.1, 0.1, (20, 3)) * [1, 1, 0]
+    hidden = hidden_by_screen(rig, points, d)
+    for p, row in zip(points, hidden, strict=True):
+        np.testing.assert_array_equal(row, screen_coordinates(rig, p, d)[2])
+    assert 0.05 < hidden.mean() < 0.3

@@ -1,0 +1,76 @@
+"""Light that is no image of the room: a veil over the ball, and the screen's own, spread."""
+
+import numpy as np
+import pytest
+from scipy import ndimage
+from synthetic_photo import blocks, grey_table, photograph, sky, textured_table
+
+from invrender.capture.environment import fill_environment, unfold_environment
+from invrender.capture.glare import lift_veil
+from invrender.capture.mirror import make_ball
+from invrender.capture.table import room_irradiance
+from invrender.files.images import Photo
+from invrender.rig import Rig
+
+RIG, SIZE = Rig(), (720, 960)
+BALL = make_ball(RIG, RIG.ball_centre, RIG.ball_radius, SIZE)
+
+
+@pytest.fixture(scope="module", params=[grey_table, textured_table])
+def image(request):
+    return photograph(RIG, *SIZE, sky, request.param, blocks())
+
+
+def veil(angle, width, colour):
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]] + 0.5
+    u = (x - BALL.centre[0]) / BALL.radius - np.cos(angle)
+    v = (y - BALL.centre[1]) / BALL.radius - np.sin(angle)
+    return np.exp(-(u**2 + v**2) / width**2)[..., None] * np.array(colour)
+
+
+@pytest.mark.parametrize("angle", [0.5, 4.0])
+def test_a_veil_is_lifted(image, angle):
+    light = veil(angle, 0.5, (0.3, 0.4, 0.35))
+    found = lift_veil(Photo((image + light).astype(np.float32)), RIG, BALL).image
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]] + 0.5
+    above = np.hypot(x - BALL.centre[0], y - BALL.centre[1]) < 0.7 * BALL.radius
+    assert np.abs(found - image)[above].mean() < 0.3 * light[above].mean()
+
+
+def test_without_a_veil_nothing_changes(image):
+    rng = np.random.default_rng(3)
+    noisy = image + 0.02 * rng.standard_normal(image.shape)
+    for photo in (Photo(image), Photo(np.maximum(noisy, 0).astype(np.float32))):
+        assert lift_veil(photo, RIG, BALL) is photo
+    black = Photo(np.zeros_like(image))
+    assert lift_veil(black, RIG, BALL) is black
+
+
+def test_saturated_pixels_stay_saturated(image):
+    light = image + veil(2.0, 0.5, (2.0, 2.0, 2.0))
+    photo = Photo(np.minimum(light, 1).astype(np.float32), 0.99)
+    found = lift_veil(photo, RIG, BALL)
+    assert photo.clipped.any() and (found.clipped == photo.clipped).all()
+
+
+def test_the_screen_does_not_light_the_room_beside_it():
+    """A room 30 times as dark as the screen: its light must not count as the room's."""
+    level = 0.1
+    dark = photograph(RIG, *SIZE, lambda d: level + 0 * d, grey_table, blocks(), (3.0, 3.0, 3.0))
+    photo = Photo(ndimage.gaussian_filter(dark, (1.2, 1.2, 0)))
+    even = np.where(np.arange(64)[:, None, None] < 32, level, 0) * np.ones((64, 128, 3))
+
+    def error(blur):
+        room, coverage = unfold_environment(photo, RIG, BALL, 64, blur=blur)
+        assert coverage[:32].mean() > 0.6
+        found, true = (
+            room_irradiance(RIG, np.zeros((1, 3)), e)
+            for e in (fill_environment(room, coverage), even)
+        )
+        return np.abs(room[:24] / level - 1)[coverage[:24] > 0].max(), np.abs(
+            found / true - 1
+        ).max()
+
+    (texel, light), (told_texel, told_light) = error(0), error(1.2)
+    assert texel > 1 and told_texel < 0.3
+    assert light > 0.05 and told_light < 0.02

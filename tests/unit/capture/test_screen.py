@@ -1,0 +1,97 @@
+"""The screen's pose, curve and gain from its image in the ball: slopes, a fit that settles."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import ndimage
+from synthetic_photo import blocks, photograph
+
+from invrender.capture import screen
+from invrender.capture.mirror import make_ball
+from invrender.files.images import Photo
+from invrender.rig import Rig
+
+SIZE = (720, 960)
+RIG = Rig()
+MOVED = replace(RIG, screen_shift=(0.003, -0.002, 0.002), screen_tilt=(2.0, -1.5, 1.0))
+GAIN = (2.0, 2.1, 1.9)
+BALL = make_ball(RIG, RIG.ball_centre, RIG.ball_radius, SIZE)
+
+
+@pytest.fixture(scope="module")
+def clean():
+    return photograph(MOVED, *SIZE, gain=GAIN)
+
+
+@pytest.fixture(scope="module")
+def hard(clean):
+    """Blurred, noisy, 8 bits."""
+    image = ndimage.gaussian_filter(clean, (1.3, 1.3, 0))
+    rng = np.random.default_rng(1)
+    image = image + 0.04 * np.sqrt(image) * rng.standard_normal(image.shape)
+    return (np.round(np.clip(image, 0, 2.2) * 60) / 60).astype(np.float32)
+
+
+def unknowns(fit, seed=0):
+    """Some way from the start."""
+    u = fit.start()
+    u[:9] = np.random.default_rng(seed).normal(0, 0.2, 9)
+    u[12] -= 0.2
+    return u
+
+
+def test_the_slopes_are_those_of_the_cost(hard):
+    fit = screen._Fit(Photo(hard), RIG, BALL, blocks())
+    fit.free[:] = True
+    u = unknowns(fit)
+    fit.suppose(u)
+    _, downhill = fit.normal_equations(u)
+    step = 1e-3 * np.eye(14)
+    slope = np.array([fit.cost(u - d) - fit.cost(u + d) for d in step]) / 2e-3
+    np.testing.assert_allclose(downhill, slope, atol=0.03 * np.abs(slope).max())
+
+
+def test_the_fits_screen_is_the_rigs(hard):
+    fit = screen._Fit(Photo(hard), RIG, BALL, blocks())
+    several = np.stack([unknowns(fit, k) for k in range(3)])
+    for u, *found in zip(several, *fit.screen(several), strict=True):
+        rig = fit.moved(u)
+        for got, wanted in zip(found, (*rig.screen_edges, rig.screen_corner), strict=True):
+            np.testing.assert_allclose(got, wanted, rtol=1e-12, atol=1e-15)
+    below = unknowns(fit, 0)
+    below[2] = -RIG.screen_height / (screen.SHIFT_PRIOR * RIG.sample_size)
+    assert fit.cost(below) == np.inf
+
+
+def test_lines_meet_the_screen_where_rays_do():
+    fit = screen._Fit(Photo(np.ones((*SIZE, 3), np.float32)), RIG, BALL, blocks())
+    u = np.zeros(13)
+    u[:6] = [0.3, -0.2, 0.4, 0.3, -0.5, 0.2]
+    a, b, c = np.moveaxis(fit.lines @ fit.forms(u), -1, 0)
+    direction = fit.lines[..., 3:]
+    point = np.cross(direction, fit.lines[..., :3])  # of each line, the nearest to the origin
+    s, t, _ = screen.screen_coordinates(fit.moved(u), point, direction)
+    np.testing.assert_allclose(a / c, s, rtol=1e-7, atol=1e-7)
+    np.testing.assert_allclose(b / c, t, rtol=1e-7, atol=1e-7)
+
+
+def test_a_moved_screen_is_found(clean):
+    found = screen.fit_screen(Photo(clean), RIG, BALL, blocks())
+    shift = np.subtract(found.rig.screen_shift, MOVED.screen_shift)
+    tilt = np.subtract(found.rig.screen_tilt, MOVED.screen_tilt)
+    assert np.linalg.norm(shift) < 6e-4
+    assert np.linalg.norm(tilt) < 0.4
+    np.testing.assert_allclose(found.gain, GAIN, rtol=0.01)
+
+
+def test_a_ball_moved_by_nothing_changes_nothing(hard):
+    """The fit settles: no chain of undamped steps amplifies the last digits."""
+    x, y, z = BALL.position
+    gain, moved = (
+        screen.fit_screen(
+            Photo(hard), RIG, replace(BALL, position=(x + d, y - d, z)), blocks()
+        ).gain
+        for d in (0, 1e-10 * RIG.ball_radius)
+    )
+    np.testing.assert_allclose(moved, gain, rtol=1e-6)

@@ -1,0 +1,298 @@
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from invrender.cli.main import EXAMPLE  # noqa: E402
+from invrender.maps import constant_maps, resize_maps  # noqa: E402
+from invrender.pattern.default import block_pattern  # noqa: E402
+from invrender.pipeline import Stages, recover, refine_capture, see  # noqa: E402
+from invrender.refine.lobes import fit_lobes  # noqa: E402
+from invrender.render.renderer import material_from_maps, prepare, radiance  # noqa: E402
+from invrender.render.scene import make_scene, make_view  # noqa: E402
+from invrender.rig import Rig  # noqa: E402
+from invrender.sampling import resize  # noqa: E402
+from nets.batch import positions  # noqa: E402
+from nets.correction import ALBEDO_CORRELATION, INPUTS, NOISE, Correction, features, gauss_newton  # noqa: E402
+from nets.predict import Corrector, Estimate, Reconstructor, linearised  # noqa: E402
+from nets.store import build, load_weights, save_weights  # noqa: E402
+
+SIZE = 12
+LOBES = constant_maps(SIZE, SIZE, 0.35, 0.04, 0.45)
+torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="module")
+def lit():
+    """A prepared scene and the photo of a flat sample in it."""
+    prepared = prepare(make_scene(Rig(), block_pattern(64), None, gain=2.0))
+    maps = constant_maps(SIZE, SIZE, 0.4, 0.04, 0.4)
+    view = make_view(prepared.scene, SIZE, SIZE)
+    color = radiance(prepared, view, material_from_maps(maps), 64)
+    return prepared, np.asarray(color).T.reshape(SIZE, SIZE, 3)
+
+
+def guess(diffuse=0.3, unit=0.7):
+    sigma = {"normal": 0.05, "diffuse": 0.1, "roughness": 0.1, "specular": 0.05}
+    grids = {k: np.full((SIZE, SIZE), v, np.float32) for k, v in sigma.items()}
+    return Estimate(constant_maps(SIZE, SIZE, diffuse, 0.04, 0.5), grids, unit)
+
+
+def random_batch(dtype=torch.float64):
+    torch.manual_seed(1)
+    shape = (2, 1, 5, 4)
+    rand = lambda n: torch.rand(2, n, 5, 4, dtype=dtype)  # noqa: E731
+    return {
+        "photo": rand(3),
+        "image": rand(3),
+        "theta": rand(9),
+        "sigma0": 0.02 + 0.2 * rand(4),
+        "jacobian": torch.cat([rand(6), rand(9) - 0.5], 1),
+        "clipped": torch.zeros(shape, dtype=dtype),
+        "lobes": rand(7),
+        "position": positions(5, 4)[None].repeat(2, 1, 1, 1).to(dtype),
+    }
+
+
+def test_gauss_newton_is_the_formula():
+    b = random_batch()
+    residual, step, surprise = gauss_newton(b)
+    s = b["sigma0"][1, :, 2, 3].numpy()
+    sigma = np.diag([s[1]] * 3 + [s[3]] * 3 + [s[2]] + [2 * s[0]] * 2)
+    correlation = np.eye(9)
+    for at, rho in zip((0, 3), ALBEDO_CORRELATION, strict=True):
+        correlation[at : at + 3, at : at + 3] = rho + (1 - rho) * np.eye(3)
+    j = b["jacobian"][1, :, 2, 3].numpy().reshape(5, 3)
+    jacobian = np.concatenate([np.diag(j[0]), np.diag(j[1]), j[2:].T], 1)
+    photo = b["photo"][1, :, 2, 3].numpy()
+    noise = np.diag((NOISE[0] * photo) ** 2 + NOISE[1] ** 2)
+    spread = jacobian @ sigma @ correlation @ sigma @ jacobian.T + noise
+    r = photo - b["image"][1, :, 2, 3].numpy()
+    white = np.linalg.solve(spread, r)
+    expected = correlation @ sigma @ jacobian.T @ white
+    np.testing.assert_allclose(residual[1, :, 2, 3].numpy(), r)
+    np.testing.assert_allclose(step[1, :, 2, 3].numpy(), expected, rtol=1e-8)
+    np.testing.assert_allclose(surprise[1, 0, 2, 3].numpy(), r @ white / 3, rtol=1e-8)
+
+
+def test_saturated_pixels_say_nothing():
+    b = random_batch()
+    b["clipped"][:, :, :2] = 1
+    residual, step, _ = gauss_newton(b)
+    assert not residual[:, :, :2].any() and not step[:, :, :2].any()
+    assert step[:, :, 2:].any()
+
+
+def test_a_fresh_correction_changes_next_to_nothing(lit):
+    prepared, photo = lit
+    start = guess()
+    corrector = Corrector.__new__(Corrector)
+    corrector.network = build("correction").eval()
+    after = corrector(photo, prepared, start)
+    np.testing.assert_allclose(after.maps.diffuse, start.maps.diffuse, atol=0.02)
+    np.testing.assert_allclose(after.maps.normal, start.maps.normal, atol=1e-6)
+    np.testing.assert_allclose(after.sigma["roughness"], start.sigma["roughness"], rtol=1e-5)
+
+
+def test_the_step_it_sees_points_at_the_truth(lit):
+    """A sample darker than it should be: the proposed step brightens the diffuse albedo."""
+    prepared, photo = lit
+    inputs = linearised(photo, prepared, guess(0.3), LOBES, None, 64)
+    batch = {k: torch.from_numpy(v)[None] for k, v in inputs.items()}
+    _, step, _ = gauss_newton(batch)
+    assert (step[:, :3] > 0).float().mean() > 0.95
+    assert features(batch).shape == (1, INPUTS, SIZE, SIZE)
+
+
+def test_unit_of_radiance_does_not_matter(lit):
+    prepared, photo = lit
+    brighter = prepare(make_scene(Rig(), block_pattern(64), None, gain=200.0))
+    a = linearised(photo, prepared, guess(unit=0.7), LOBES, None, 64)
+    b = linearised(100 * photo, brighter, guess(unit=70.0), LOBES, None, 64)
+    for k, v in a.items():
+        np.testing.assert_allclose(b[k], v, rtol=2e-3, atol=1e-4, err_msg=k)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 0.0, 1e30])
+def test_nothing_but_numbers_leaves(value):
+    network = build("correction").eval()
+    with torch.no_grad():
+        for p in network.parameters():
+            p.normal_(0, 0.1)
+    b = {k: v.float() for k, v in random_batch().items()}
+    b["photo"][:, :, 1] = value
+    b["image"][:, :, 2] = value
+    with torch.inference_mode():
+        out = network(b)
+    for k, v in out.items():
+        assert torch.isfinite(v).all(), k
+
+
+@pytest.mark.parametrize(("settled", "passes"), [(1.0, 1), (0.0, 3)])
+def test_passes_go_on_until_roughness_settles(lit, monkeypatch, settled, passes):
+    prepared, photo = lit
+    monkeypatch.setattr("nets.predict.SETTLED", settled)
+    network = restless()
+    corrector = Corrector.__new__(Corrector)
+    corrector.network = network
+    lobes = fit_lobes(photo, prepared, 64)
+    expected = guess()
+    for _ in range(passes):
+        expected = corrector._step(photo, prepared, expected, lobes, None, 64)
+    got = corrector(photo, prepared, guess())
+    np.testing.assert_allclose(got.maps.roughness, expected.maps.roughness, atol=1e-6)
+    assert np.abs(got.maps.roughness - guess().maps.roughness).mean() > 1e-3
+
+
+def test_roughness_at_large_is_that_of_the_training_size(lit, monkeypatch):
+    """Its large shades are those that a step at `COARSE` finds, its details the step's own."""
+    prepared, photo = lit
+    monkeypatch.setattr("nets.predict.PASSES", 1)
+    corrector = Corrector.__new__(Corrector)
+    corrector.network = restless()
+    own = corrector(photo, prepared, guess()).maps
+    monkeypatch.setattr("nets.predict.COARSE", SIZE // 2)
+    both = corrector(photo, prepared, guess()).maps
+    low = (SIZE // 2, SIZE // 2)
+    lobes = resize_maps(fit_lobes(photo, prepared, 64), *low)
+    start = guess()
+    start = replace(
+        start,
+        maps=resize_maps(start.maps, *low),
+        sigma={k: resize(v, *low) for k, v in start.sigma.items()},
+    )
+    coarse = corrector._step(resize(photo, *low), prepared, start, lobes, None, 64).maps.roughness
+    shades = resize(coarse - resize(own.roughness, *low), SIZE, SIZE)
+    np.testing.assert_allclose(both.roughness, own.roughness + shades, atol=1e-5)
+    assert np.abs(shades).max() > 1e-3
+    np.testing.assert_array_equal(both.diffuse, own.diffuse)
+
+
+def restless():
+    """A correction that changes something at every pass."""
+    torch.manual_seed(2)
+    network = build("correction").eval()
+    with torch.no_grad():
+        network.decoder.ending.weight.normal_(0, 0.1)
+    return network
+
+
+def test_an_interrupted_correction_keeps_the_passes_done(lit, monkeypatch):
+    prepared, photo = lit
+    monkeypatch.setattr("nets.predict.SETTLED", 0.0)
+    corrector = Corrector.__new__(Corrector)
+    network, calls = restless(), []
+
+    def stops(batch):
+        if calls:
+            raise KeyboardInterrupt
+        calls.append(batch)
+        return network(batch)
+
+    corrector.network = network
+    assert not corrector(photo, prepared, guess()).interrupted
+    once = corrector._step(photo, prepared, guess(), fit_lobes(photo, prepared, 64), None, 64)
+    corrector.network = stops
+    best = corrector(photo, prepared, guess())
+    assert best.interrupted
+    np.testing.assert_allclose(best.maps.diffuse, once.maps.diffuse, atol=1e-6)
+
+
+def test_of_a_large_photo_the_large_shades_are_corrected(lit, monkeypatch):
+    """They are those of the photo shrunk, whose doubts count as well; the details stay."""
+    prepared, photo = lit
+    corrector = Corrector.__new__(Corrector)
+    corrector.network = restless()
+    low = (SIZE // 2, SIZE // 2)
+    start = guess()
+    start.maps.diffuse[::2] += 0.01
+    small = Estimate(
+        resize_maps(start.maps, *low), {k: resize(v, *low) for k, v in start.sigma.items()}, 0.7
+    )
+    whole = corrector(resize(photo, *low), prepared, small)
+    monkeypatch.setattr("nets.predict.WHOLE", SIZE // 2)
+    found = corrector(photo, prepared, start)
+    for name in ("diffuse", "specular", "roughness"):
+        got, old, new = (getattr(e.maps, name) for e in (found, start, whole))
+        shades = resize(new - resize(old, *low), SIZE, SIZE)
+        np.testing.assert_allclose(got, np.clip(old + shades, 0, 1), atol=1e-5, err_msg=name)
+        assert np.abs(shades).max() > 1e-3
+    np.testing.assert_allclose(found.sigma["diffuse"], resize(whole.sigma["diffuse"], SIZE, SIZE))
+    np.testing.assert_allclose(np.linalg.norm(found.maps.normal, axis=-1), 1, atol=1e-5)
+
+
+def test_no_normal_points_below_the_surface(lit, monkeypatch):
+    """Not even steep details on shades that the correction turned the other way."""
+    prepared, photo = lit
+    corrector = Corrector.__new__(Corrector)
+    corrector.network = restless()
+    start = guess()
+    start.maps.normal[::2] = [0.9999, 0, 0.0141]
+    monkeypatch.setattr("nets.predict.WHOLE", SIZE // 2)
+    normal = corrector(photo, prepared, start).maps.normal
+    assert (normal[..., 2] > 0).all()
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=-1), 1, atol=1e-5)
+
+
+def test_an_interrupted_run_leaves_the_best_and_goes_on(tmp_path, monkeypatch):
+    monkeypatch.setattr("nets.predict.TILE", 16)
+    monkeypatch.setattr("nets.predict.OVERLAP", 4)
+    forward = Correction.forward
+
+    def stops(self, batch):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Correction, "forward", stops)
+    out, parts = tmp_path / "out", tmp_path / ".out.unfinished"
+    with pytest.raises(KeyboardInterrupt, match="best maps so far"):
+        refine_capture(EXAMPLE, out, size=24)
+    report = json.loads((out / "report.json").read_text())
+    assert "interrupted: these are the best maps so far" in report["warnings"]
+    assert report["map_error"]["initial"] == pytest.approx(report["map_error"]["refined"], rel=0.05)
+    assert len(list(parts.glob("*/*.safetensors"))) == 4  # the first network's tiles
+    monkeypatch.setattr(Correction, "forward", forward)
+    refine_capture(EXAMPLE, out, size=24)
+    assert not parts.exists()
+    again = json.loads((out / "report.json").read_text())
+    refine_capture(EXAMPLE, tmp_path / "fresh", size=24)
+    fresh = json.loads((tmp_path / "fresh" / "report.json").read_text())
+    assert again["map_error"]["refined"] == pytest.approx(fresh["map_error"]["refined"], rel=1e-4)
+
+
+def test_an_interrupt_ends_all_photos(monkeypatch):
+    seen = see(EXAMPLE, 16, Stages())
+    calls = []
+
+    def improve(photo, prepared, estimate, *_):
+        calls.append(photo)
+        return replace(estimate, interrupted=True)
+
+    monkeypatch.setattr("invrender.pipeline._networks", lambda: (Reconstructor(), improve))
+    maps, result, _ = recover([seen, seen], Stages())
+    assert len(calls) == 1 and result.interrupted
+    np.testing.assert_allclose(result.maps.diffuse, maps.diffuse, atol=0.02)
+
+
+def test_weights_come_back(tmp_path):
+    network = build("correction")
+    save_weights(tmp_path / "c.safetensors", network, {})
+    again, _ = load_weights(tmp_path / "c.safetensors")
+    assert type(again) is type(network)
+    for k, v in network.state_dict().items():
+        torch.testing.assert_close(again.state_dict()[k], v)
+
+
+def test_lobes_are_followed_where_trusted(lit):
+    """With its doubt taken away, the correction gives the lobes' albedo and roughness."""
+    prepared, photo = lit
+    network = build("correction").eval()
+    with torch.no_grad():
+        network.decoder.ending.bias[13:] = 50
+    batch = linearised(photo, prepared, guess(), LOBES, None, 64)
+    with torch.inference_mode():
+        out = network({k: torch.from_numpy(v)[None] for k, v in batch.items()})
+    np.testing.assert_allclose(out["roughness"][0, 0].numpy(), LOBES.roughness, atol=1e-5)
+    np.testing.assert_allclose(out["diffuse"][0, 0].numpy(), LOBES.diffuse[..., 0], atol=1e-5)

@@ -1,0 +1,306 @@
+"""Initial maps, lobes and refinement on photos rendered from known maps."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from invrender.data.environments import procedural_environment
+from invrender.data.materials import procedural_material
+from invrender.maps import constant_maps, map_errors, turn_maps
+from invrender.pattern.default import block_pattern
+from invrender.pipeline import BAKED
+from invrender.refine import gauss_newton as refinement
+from invrender.refine.cautious import correct
+from invrender.refine.checks import baked_light, coarse_error
+from invrender.refine.flat import flat_maps
+from invrender.refine.gauss_newton import Shot, linearise, refine
+from invrender.refine.lobes import fit_lobes, read_lobes
+from invrender.refine.priors import Prior, lobe_prior, network_prior, pooled
+from invrender.refine.several import find_turn, turned_environment, turned_rig
+from invrender.refine.theta import MIN_ROUGHNESS, to_maps, to_theta
+from invrender.render.renderer import prepare, render
+from invrender.render.scene import make_scene
+from invrender.rig import Rig
+from invrender.sphere import scale_environment
+
+RIG, PATTERN, GAIN = Rig(), block_pattern(64), 2.0
+SIZE = 32
+
+
+@pytest.fixture(scope="module")
+def environment():
+    return scale_environment(procedural_environment(3, 64), 0.3)
+
+
+@pytest.fixture(scope="module")
+def prepared(environment):
+    return prepare(make_scene(RIG, PATTERN, environment, GAIN))
+
+
+def photo_of(maps, environment, samples=64):
+    return render(RIG, maps, PATTERN, environment, GAIN, samples=samples)
+
+
+def test_theta_round_trip():
+    rng = np.random.default_rng(0)
+    maps = constant_maps(8, 8)
+    maps.diffuse[:] = rng.random((8, 8, 3))
+    slopes = rng.normal(0, 0.3, (8, 8, 2))
+    maps.normal[..., :2] = slopes
+    maps.normal /= np.linalg.norm(maps.normal, axis=-1, keepdims=True)
+    back = to_maps(to_theta(maps))
+    assert max(map_errors(back, maps).values()) < 1e-6
+
+
+def test_linearise_predicts_small_changes(prepared):
+    rng = np.random.default_rng(1)
+    theta = to_theta(constant_maps(SIZE, SIZE, 0.4, 0.1, 0.5))
+    theta += 0.05 * rng.standard_normal(theta.shape).astype(np.float32)
+    step = 2e-4 * rng.standard_normal(theta.shape).astype(np.float32)
+    image, jacobian = linearise(prepared, theta, 64)
+    moved, _ = linearise(prepared, theta + step, 64)
+    predicted = np.einsum("hwcp,hwp->hwc", jacobian, step)
+    error = np.linalg.norm(moved - image - predicted) / np.linalg.norm(predicted)
+    assert error < 0.02
+
+
+@pytest.mark.parametrize(
+    ("k_d", "k_s", "rho"),
+    [
+        ((0.4, 0.3, 0.2), 0.04, 0.55),
+        ((0.05, 0.06, 0.1), 0.04, 0.23),
+        ((0, 0, 0), (0.9, 0.7, 0.4), 0.32),
+    ],
+    ids=["matt", "glossy", "metal"],
+)
+def test_lobe_of_a_uniform_sample_is_found(prepared, environment, k_d, k_s, rho):
+    truth = constant_maps(SIZE, SIZE, k_d, k_s, rho)
+    maps = fit_lobes(photo_of(truth, environment), prepared)
+    error = map_errors(maps, truth)
+    assert error["roughness"] < 0.02
+    assert error["specular"] < 0.02
+    assert error["diffuse"] < 0.02
+
+
+@pytest.mark.parametrize("metal", [False, True])
+def test_readings_of_dielectric_and_metal(prepared, environment, metal):
+    """Of a textured sample: all three odds name its kind, whose readings are the truth."""
+    rng = np.random.default_rng(0)
+    truth = constant_maps(SIZE, SIZE, 0.3, 0.04, 0.32)
+    if metal:
+        truth = constant_maps(SIZE, SIZE, 0, (0.9, 0.7, 0.4), 0.32)
+    texture = rng.uniform(0.9, 1.1, (SIZE, SIZE, 1)).astype(np.float32)
+    truth.diffuse, truth.specular = truth.diffuse * texture, truth.specular * texture**metal
+    lobes = read_lobes(photo_of(truth, environment), prepared)
+    readings = lobes.readings
+    assert readings.shape == (SIZE, SIZE, 16) and lobes.costs.shape == (40,)
+    assert ((readings[..., 8:11] > 0) == metal).all()
+    color, rho = (readings[..., 4:7], 7) if metal else (readings[..., :3], 3)
+    wanted = truth.specular if metal else truth.diffuse
+    assert np.abs(color - wanted).mean() < 0.02
+    assert np.abs(readings[..., [rho, 12 if metal else 11]] - 0.32).max() < 0.08
+    assert np.abs(readings[..., 13:] - truth.specular).mean() < 0.05 or not metal
+    costs = lobes.costs.reshape(2, 2, -1)
+    assert (costs[:, int(metal)].min(-1) == 0).all() and (costs >= 0).all()
+
+
+def test_white_under_lights_told_too_dark_is_no_metal(prepared, environment):
+    """No albedo is above one, but lights may be told half as bright as they are."""
+    rng = np.random.default_rng(0)
+    truth = constant_maps(SIZE, SIZE, 0.85, 0.04, 0.9)
+    truth.diffuse *= rng.uniform(0.95, 1.05, (SIZE, SIZE, 1)).astype(np.float32)
+    maps = fit_lobes(2.2 * photo_of(truth, environment), prepared)
+    assert maps.specular.max() < 0.1
+    assert maps.diffuse.min() > 0.9
+
+
+def test_two_materials_get_two_lobes(prepared, environment):
+    truth = constant_maps(SIZE, SIZE, (0.5, 0.3, 0.1), 0.04, 0.7)
+    half = SIZE // 2
+    truth.diffuse[:, :half], truth.specular[:, :half] = 0, 0.8
+    truth.roughness[:, :half] = 0.32
+    photo = photo_of(truth, environment)
+    start, maps = flat_maps(photo, prepared), fit_lobes(photo, prepared)
+    assert map_errors(maps, truth)["average"] < 0.4 * map_errors(start, truth)["average"]
+
+
+def test_photo_of_the_prior_changes_nothing(prepared, environment):
+    maps = constant_maps(SIZE, SIZE, 0.3, 0.04, 0.5)
+    result = refine([Shot(photo_of(maps, environment), prepared)], lobe_prior(maps))
+    assert result.converged
+    assert max(map_errors(result.maps, maps).values()) < 1e-3
+
+
+def test_normals_are_recovered_where_all_else_is_known(prepared, environment):
+    truth = constant_maps(SIZE, SIZE, 0.3, 0.3, 0.4)
+    y, x = np.mgrid[:SIZE, :SIZE] / SIZE * 2 * np.pi
+    # Slight relief: a reflection must not jump from one block of the pattern to the next.
+    truth.normal[..., 0], truth.normal[..., 1] = 0.05 * np.sin(2 * x), 0.05 * np.cos(3 * y)
+    truth.normal /= np.linalg.norm(truth.normal, axis=-1, keepdims=True)
+    photo = photo_of(truth, environment)
+    start = constant_maps(SIZE, SIZE, 0.3, 0.3, 0.4)
+    sigma = np.full((SIZE, SIZE, 9), 1e-3, np.float32)
+    sigma[..., 7:] = 0.3
+    prior = Prior(to_theta(start), sigma, np.eye(9, dtype=np.float32))
+    result = refine([Shot(photo, prepared)], prior)
+    before, after = map_errors(start, truth), map_errors(result.maps, truth)
+    assert after["normal"] < 0.7 * before["normal"]
+    errors = [h["photo_error"] for h in result.history]
+    assert errors[-1] < 0.3 * errors[0]
+    # The photo tells slopes, but the assumed noise leaves some doubt: about as much as there is.
+    left = result.sigma[..., 7:]
+    assert np.median(left) < 0.1
+    error = (to_theta(result.maps) - to_theta(truth))[..., 7:]
+    assert 0.2 < np.sqrt(np.mean((error / left) ** 2)) < 1.5
+
+
+def test_clipped_pixels_keep_their_prior(prepared, environment):
+    truth = constant_maps(SIZE, SIZE, 0.5, 0.04, 0.5)
+    prior = lobe_prior(constant_maps(SIZE, SIZE, 0.2, 0.04, 0.5))
+    clipped = np.zeros((SIZE, SIZE), bool)
+    clipped[:8] = True
+    result = refine([Shot(photo_of(truth, environment), prepared, clipped)], prior)
+    np.testing.assert_allclose(result.maps.diffuse[:8], 0.2, atol=1e-3)
+    assert result.maps.diffuse[8:].mean() > 0.25
+
+
+@pytest.mark.parametrize("value", [0.0, 1e-6, 1e4])
+def test_any_photo_gives_finite_maps_in_range(prepared, value):
+    photo = np.full((8, 8, 3), value, np.float32)
+    maps = fit_lobes(photo, prepared)
+    result = refine([Shot(photo, prepared)], lobe_prior(maps), iterations=3)
+    for image in result.maps.encoded().values():
+        assert np.isfinite(image).all() and image.min() >= 0 and image.max() <= 1
+    assert (result.maps.diffuse + result.maps.specular).max() <= 1 + 1e-6
+    assert result.maps.roughness.min() >= MIN_ROUGHNESS
+    assert np.isfinite(result.sigma).all()
+
+
+def test_one_pixel(prepared):
+    photo = np.full((1, 1, 3), 0.1, np.float32)
+    result = refine([Shot(photo, prepared)], lobe_prior(fit_lobes(photo, prepared)))
+    assert result.maps.shape == (1, 1)
+
+
+def test_correction_of_a_networks_maps(prepared, environment):
+    """Wrong albedos move to the truth, roughness stays, and what is clipped keeps its prior."""
+    truth = constant_maps(SIZE, SIZE, 0.4, 0.04, 0.5)
+    start = constant_maps(SIZE, SIZE, 0.48, 0.04, 0.5)
+    sigma = {k: np.full((SIZE, SIZE), 0.05, np.float32) for k in ("diffuse", "roughness", "normal")}
+    sigma["specular"] = np.full((SIZE, SIZE), 0.005, np.float32)
+    clipped = np.zeros((SIZE, SIZE), bool)
+    clipped[:8] = True
+    prior = network_prior(start, sigma)
+    result = correct([Shot(photo_of(truth, environment), prepared, clipped)], prior)
+    assert map_errors(result.maps, truth)["diffuse"] < 0.7 * map_errors(start, truth)["diffuse"]
+    assert np.array_equal(result.maps.roughness, start.roughness)
+    assert result.maps.diffuse[:8] == pytest.approx(start.diffuse[:8], abs=1e-5)
+    assert prior.total is not None
+    assert (result.sigma <= prior.total * 1.0001).all()
+    assert (result.sigma[8:, :, 0] < 0.95 * prior.total[8:, :, 0]).all()
+
+
+def wrong_by(truth, seed):
+    """Maps off by what all of the material shares and by relief, and their expected errors."""
+    rng = np.random.default_rng(seed)
+    theta = to_theta(truth)
+    theta[..., :3] += 0.06 * rng.standard_normal(3).astype(np.float32)
+    theta[..., 3:6] += np.float32(0.02 * rng.standard_normal())
+    theta[..., 7:] += 0.1 * rng.standard_normal(theta[..., 7:].shape).astype(np.float32)
+    names = ("diffuse", "specular", "roughness", "normal")
+    sigma = {k: np.full(truth.shape, 0.05, np.float32) for k in names}
+    return network_prior(to_maps(theta), sigma)
+
+
+def test_two_photos_tell_more_than_one(prepared, environment):
+    """The second under another pattern and with the sample turned."""
+    truth = procedural_material(5, SIZE, SIZE, kind="leather")
+    other = PATTERN[::-1, :, ::-1].copy()
+    photo = render(RIG, turn_maps(truth, 1), other, environment, GAIN)
+    turned = make_scene(turned_rig(RIG, -1), other, turned_environment(environment, -1), GAIN)
+    shots = [
+        Shot(photo_of(truth, environment), prepared),
+        Shot(np.ascontiguousarray(np.rot90(photo, -1)), prepare(turned)),
+    ]
+    # The turned photo is what the turned lights make of the sample that lies as before.
+    image, _ = linearise(shots[1].prepared, to_theta(truth), 64)
+    assert np.abs(image - shots[1].photo).mean() < 0.02 * image.mean()
+
+    prior = wrong_by(truth, 0)
+    for step in (correct, refine):
+        one = map_errors(step(shots[:1], prior).maps, truth)["average"]
+        two = map_errors(step(shots, prior).maps, truth)["average"]
+        assert two < 0.98 * one
+
+
+def test_pooled_priors_weigh_by_precision():
+    maps = constant_maps(2, 2, 0.2, 0.04, 0.4), constant_maps(2, 2, 0.5, 0.04, 0.4)
+    names = ("diffuse", "specular", "roughness", "normal")
+    priors = [
+        network_prior(m, {k: np.full((2, 2), s, np.float32) for k in names})
+        for m, s in zip(maps, (0.01, 0.02), strict=True)
+    ]
+    both = pooled(priors)
+    assert both.mean[..., 0] == pytest.approx(0.2 + 0.3 * 0.2)  # weights 4 : 1
+    assert (both.sigma[..., 0] > 0.01).all() and (both.sigma[..., 0] < 0.02).all()
+
+
+def test_turn_is_found():
+    maps = procedural_material(2, 64, 64, kind="bricks")
+    for k in range(4):
+        assert find_turn(turn_maps(maps, k), maps) == k
+    plain = constant_maps(8, 8)
+    assert find_turn(plain, plain) == 0
+
+
+def test_bands_give_what_the_whole_gives(prepared, environment, monkeypatch):
+    truth = procedural_material(7, SIZE, SIZE)
+    shots, prior = [Shot(photo_of(truth, environment), prepared)], wrong_by(truth, 1)
+    whole = refine(shots, prior, iterations=2), correct(shots, prior)
+    monkeypatch.setattr(refinement, "BAND", 5 * SIZE)
+    parts = refine(shots, prior, iterations=2), correct(shots, prior)
+    for a, b in zip(whole, parts, strict=True):
+        assert max(map_errors(a.maps, b.maps).values()) < 1e-3
+        np.testing.assert_allclose(a.sigma, b.sigma, atol=1e-3)
+        assert a.history[0]["photo_error"] == pytest.approx(b.history[0]["photo_error"])
+
+
+def test_interrupt_keeps_the_best_so_far(prepared, environment):
+    truth = constant_maps(SIZE, SIZE, 0.5, 0.04, 0.5)
+    prior = lobe_prior(constant_maps(SIZE, SIZE, 0.45, 0.04, 0.5))
+
+    def stop(step, error):
+        if step == 1:
+            raise KeyboardInterrupt
+
+    result = refine([Shot(photo_of(truth, environment), prepared)], prior, progress=stop)
+    assert result.interrupted and not result.converged
+    error = np.abs(result.maps.diffuse - truth.diffuse).mean()
+    assert error < np.abs(prior.mean[..., :3] - truth.diffuse).mean()
+
+
+def test_albedo_that_makes_up_for_wrong_lights_is_told(prepared, environment):
+    """A matt sample: the photo is explained in any rig, but the albedo's colours tell."""
+    truth = constant_maps(SIZE, SIZE, (0.5, 0.35, 0.2), 0.04, 0.5)
+    high = replace(RIG, screen_height=1.2 * RIG.screen_height)
+    photos = photo_of(truth, environment), render(high, truth, PATTERN, environment, GAIN)
+    right, wrong = (baked_light(flat_maps(p, prepared).diffuse, prepared) for p in photos)
+    assert right < 0.3 and wrong > BAKED
+    dark = constant_maps(SIZE, SIZE, 0.0)
+    assert baked_light(dark.diffuse, prepared) == 0
+    plain = prepare(make_scene(RIG, np.ones((4, 4, 3), np.float32), None, 1.0))
+    assert baked_light(truth.diffuse, plain) == 0
+
+
+def test_coarse_error_sees_lights_and_not_texture():
+    photo = np.full((37, 50, 3), 0.5, np.float32)
+    nowhere = np.zeros(photo.shape[:2], bool)
+    assert coarse_error(1.2 * photo, photo, nowhere) == pytest.approx(0.2, rel=1e-4)
+    texture = np.random.default_rng(0).normal(0, 0.1, photo.shape).astype(np.float32)
+    assert coarse_error(photo + texture, photo, nowhere) < 0.1
+    left = np.where(np.arange(50)[None, :, None] < 25, 1.4, 1.0).astype(np.float32) * photo
+    assert coarse_error(left, photo, nowhere) == pytest.approx(0.4 / np.sqrt(2), rel=0.05)
+    assert coarse_error(left, photo, left[..., 0] > photo[..., 0]) == 0
+    assert coarse_error(photo[:1, :1], photo[:1, :1], nowhere[:1, :1]) == 0
+    assert np.isfinite(coarse_error(photo, 0 * photo, nowhere))

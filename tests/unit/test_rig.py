@@ -1,0 +1,134 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from invrender.files.rig_toml import read_rig, write_rig
+from invrender.rig import Rig
+from invrender.types import InputError
+
+TOML = """
+[screen]
+size = 0.2
+height = 0.16
+[camera]
+offset = 0.01
+[ball]
+radius = 0.01
+reflectance = [0.8, 0.85, 0.9]
+[pattern]
+image = "p.png"
+"""
+
+
+def test_screen_is_the_samples_mirror_image():
+    """Light from the screen's edges that the sample's edges mirror reaches the camera."""
+    rig = Rig()
+    corner, (e_x, e_y) = rig.screen_corner, rig.screen_edges
+    for s, t in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        point = corner + s * e_x + t * e_y
+        # Mirrored in the table, the way from the camera to the point crosses z = 0 half-way.
+        crossing = (rig.camera + point) / 2
+        on_sample = rig.sample_size / 2 * np.array([2 * s - 1, 2 * t - 1])
+        np.testing.assert_allclose(crossing[:2], on_sample, atol=1e-12)
+    assert corner[0] + rig.screen_size == pytest.approx(rig.optical_axis_x - 2 * rig.camera_offset)
+
+
+def test_ball_is_at_the_photos_centre_and_right_is_x():
+    rig = Rig()
+    np.testing.assert_allclose(rig.project(rig.ball_centre, 960, 1280), [640, 480])
+    right, up = rig.project(rig.ball_centre + np.array([[0.01, 0, 0], [0, 0.01, 0]]), 960, 1280)
+    assert right[0] > 640 and right[1] == pytest.approx(480)
+    assert up[1] < 480 and up[0] == pytest.approx(640)
+
+
+def test_fov_is_the_photos_width():
+    rig = Rig()
+    half = rig.screen_height * math.tan(math.radians(rig.fov / 2))
+    edge = rig.ball_centre + np.array([half, 0, 0])
+    assert rig.project(edge, 960, 1280)[0] == pytest.approx(1280)
+
+
+@pytest.mark.parametrize("tilt", [(0, 0, 0), (4.0, -3.0, 10.0)])
+def test_rays_undo_projection(tilt):
+    rig = replace(Rig(), camera_tilt=tilt, camera_shift=(0.003, -0.002, 0.001))
+    pixels = np.random.default_rng(0).uniform(0, 900, (50, 2))
+    points = rig.camera + 0.2 * rig.rays(pixels, 960, 1280)
+    np.testing.assert_allclose(rig.project(points, 960, 1280), pixels, atol=1e-9)
+
+
+def test_sample_points_have_row_0_at_plus_y():
+    points = Rig().sample_points(4, 4)
+    assert points[0, 0, 1] > 0 > points[0, 0, 0] and points[-1, -1, 0] > 0 > points[-1, -1, 1]
+    assert points[..., 0].max() == pytest.approx(0.09 / 2 * 0.75)
+
+
+def test_the_screens_cosines_make_its_form_factor():
+    """Of a rectangle parallel to a surface and above it: Howell's catalogue of configuration
+    factors, B-3, four corners; and nought above it."""
+    rig = Rig()
+    middle = rig.screen_corner + sum(rig.screen_edges) / 2
+    a = rig.screen_size / 2 / middle[2]
+    corner = 2 * a / math.sqrt(1 + a * a) * math.atan(a / math.sqrt(1 + a * a)) / (2 * math.pi)
+    cosines = rig.screen_cosines(middle * [[1, 1, 0], [1, 1, 2]], 200)
+    assert cosines.shape == (2, 200, 200)
+    assert cosines[0].sum() / math.pi == pytest.approx(4 * corner, rel=1e-4)
+    assert not cosines[1].any()
+
+
+def test_scale_does_not_matter():
+    small, large = Rig(), Rig(180.0, 153.0, 17.0, 9.5)
+    points = small.sample_points(5, 5)
+    np.testing.assert_allclose(
+        small.project(points, 96, 128), large.project(points * 1000, 96, 128), atol=1e-9
+    )
+
+
+def test_file_round_trip(tmp_path):
+    rig = Rig(0.2, 0.16, 0.01, 0.01, 60.0, (0.8, 0.85, 0.9), camera_tilt=(1.0, 2.0, 3.0))
+    write_rig(tmp_path / "rig.toml", rig, "p.png", "truth/")
+    assert read_rig(tmp_path / "rig.toml") == (rig, {"pattern": "p.png", "sample": "truth/"})
+
+
+def test_fov_of_the_file_comes_before_that_of_the_exif(tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text(TOML)
+    assert read_rig(path, fov=50.0)[0].fov == 50
+    assert read_rig(path)[0].fov == Rig().fov
+    path.write_text(TOML.replace("offset = 0.01", "offset = 0.01\nfov = 65"))
+    assert read_rig(path, fov=50.0)[0].fov == 65
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("size = 0.2", "size = -0.2", "must be positive"),
+        ("size = 0.2", "size = nan", "must be finite"),
+        ("size = 0.2", "size = true", "must be a number"),
+        ("size = 0.2", 'size = "big"', "must be a number"),
+        ("size = 0.2", "sise = 0.2", "unknown key 'sise'"),
+        ("size = 0.2", "", "size is missing"),
+        ("size = 0.2", "size = ", "not valid TOML"),
+        ("[screen]", "[display]", "no such section"),
+        ("height = 0.16", "height = 0", "above the table"),
+        ("height = 0.16", "height = 0.16\ntilt = [80, 0, 0]\nshift = [0, 0, -0.1]", "below the"),
+        ("radius = 0.01", "radius = -1", "must be positive"),
+        ("offset = 0.01", "offset = -0.01", "must not be negative"),
+        ("offset = 0.01", "offset = 0.01\nfov = 175", "between 1 and 170"),
+        ("[0.8, 0.85, 0.9]", "[0.8, 0.85]", "list of three"),
+        ("[0.8, 0.85, 0.9]", "1.5", "at most 1"),
+        ('"p.png"', "3", "file name"),
+    ],
+)
+def test_bad_rig_files(tmp_path, old, new, message):
+    assert old in TOML
+    (tmp_path / "rig.toml").write_text(TOML.replace(old, new))
+    with pytest.raises(InputError, match=message) as e:
+        read_rig(tmp_path / "rig.toml")
+    assert "tilted screen" in str(e.value) or str(e.value).count("\n") <= 1
+
+
+def test_missing_rig_file(tmp_path):
+    with pytest.raises(InputError, match=r"rig\.toml is missing"):
+        read_rig(tmp_path / "rig.toml")
