@@ -39,7 +39,7 @@ from invrender.data.materials import (
     load_materials,
     procedural_material,
 )
-from invrender.files.images import write_png
+from invrender.files.write import write_png
 from invrender.maps import Maps, resize_maps
 from invrender.sphere import irradiance, solid_angles
 from invrender.types import InputError

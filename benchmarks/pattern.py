@@ -23,7 +23,8 @@ from matplotlib import pyplot as plt
 from numpy.typing import NDArray
 
 from invrender.colour import linear_to_srgb
-from invrender.files.images import read_image, write_exr
+from invrender.files.images import read_image
+from invrender.files.write import write_exr
 from invrender.pattern.default import block_pattern, default_pattern
 from invrender.pattern.design import (
     CELLS,

@@ -24,8 +24,9 @@ from invrender.data.environments import find_environments, procedural_environmen
 from invrender.data.materials import find_materials, procedural_material, read_material
 from invrender.data.simulate import simulate
 from invrender.files.capture import Capture
-from invrender.files.images import read_image, write_exr
+from invrender.files.images import read_image
 from invrender.files.rig_toml import read_rig
+from invrender.files.write import write_exr
 from invrender.maps import Maps, crop_maps, resize_maps, turn_maps
 from invrender.pattern.default import default_pattern
 from invrender.pipeline import known_lights

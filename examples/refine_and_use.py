@@ -12,8 +12,9 @@ import numpy as np
 
 from invrender.cli.main import EXAMPLE
 from invrender.export import export
-from invrender.files.images import read_image, write_png
+from invrender.files.images import read_image
 from invrender.files.maps import read_maps
+from invrender.files.write import write_png
 from invrender.maps import NAMES
 from invrender.pipeline import refine_capture
 from invrender.render.point_lights import relight

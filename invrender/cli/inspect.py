@@ -18,7 +18,8 @@ from invrender.capture.mirror import Ball, horizon_points, mirror_normals, outli
 from invrender.capture.orientation import find_upright_ball
 from invrender.colour import linear_to_srgb
 from invrender.files.capture import Capture, check_photo, load_capture
-from invrender.files.images import Photo, atomic_path, read_photo, write_exr
+from invrender.files.images import Photo, read_photo
+from invrender.files.write import atomic_path, write_exr
 from invrender.pattern.default import default_pattern
 from invrender.rig import Rig
 from invrender.sampling import resize_pattern

@@ -44,8 +44,8 @@ def add_parser(commands: Any) -> None:
 
 def run(args: argparse.Namespace, console: Console) -> int:
     """Run the sub-command."""
-    from invrender.files.images import atomic_path, write_exr, write_png
     from invrender.files.rig_toml import read_rig
+    from invrender.files.write import atomic_path, write_exr, write_png
     from invrender.pattern.default import default_pattern, mirrored
     from invrender.pattern.display import pattern_page, write_display_png
     from invrender.pattern.guide import write_guide

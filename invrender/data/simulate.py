@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from invrender.files.images import write_exr
 from invrender.files.maps import write_maps
 from invrender.files.rig_toml import write_rig
+from invrender.files.write import write_exr
 from invrender.maps import Maps
 from invrender.rig import Rig
 from invrender.types import Array, InputError

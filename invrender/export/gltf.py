@@ -19,7 +19,7 @@ import numpy as np
 from invrender.export.material import Material, normal_texture, normals_seen
 from invrender.export.metalrough import F0, MetalRough, maps_of, metal_rough, with_coloured_f0
 from invrender.export.textures import Texture, encoded
-from invrender.files.images import atomic_path
+from invrender.files.write import atomic_path
 from invrender.maps import Maps
 from invrender.types import Array
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from invrender.colour import linear_to_srgb, srgb_to_linear
-from invrender.files.images import atomic_path, write_exr
+from invrender.files.write import atomic_path, write_exr
 from invrender.types import Array
 
 SUFFIXES = {"png8": ".png", "png16": ".png", "exr": ".exr", "jpeg": ".jpg"}

@@ -1,13 +1,9 @@
-"""Image files in and out: linear RGB float32 inside, sRGB only here at the boundary."""
+"""Image files in: linear RGB float32 inside, sRGB only here at the boundary."""
 
 from __future__ import annotations
 
 import math
-import os
-import tempfile
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -19,7 +15,7 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import Image
 
-from invrender.colour import linear_to_srgb, srgb_to_linear
+from invrender.colour import srgb_to_linear
 from invrender.types import Array, InputError
 
 MAX_PIXELS = 100_000_000
@@ -299,39 +295,3 @@ def _lens(tags: dict[int, Any], height: int, width: int) -> tuple[float | None, 
     if time and f_number and iso:
         exposure = time * iso / 100 / f_number**2
     return fov, exposure
-
-
-@contextmanager
-def atomic_path(path: Path) -> Iterator[Path]:
-    """A temporary path beside ``path`` that replaces it when the block ends without an error."""
-    path = Path(path)
-    fd, name = tempfile.mkstemp(prefix=".", suffix=path.suffix, dir=path.parent)
-    os.close(fd)
-    temporary = Path(name)
-    try:
-        yield temporary
-        temporary.chmod(0o644)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def write_exr(path: Path, image: Array, *, half: bool = False) -> None:
-    """Write (H, W), (H, W, 3) or (H, W, 4) linear values; refuses NaN and infinity."""
-    image = np.asarray(image)
-    if not np.all(np.isfinite(image)):
-        raise ValueError(f"refusing to write non-finite values to {path}")
-    data = np.ascontiguousarray(image.astype(np.float16 if half else np.float32))
-    channel = {"Y" if data.ndim == 2 else "RGBA"[: data.shape[2]]: data}
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with atomic_path(path) as temporary, OpenEXR.File(header, channel) as f:
-        f.write(str(temporary))
-
-
-def write_png(path: Path, image: Array, *, linear: bool = False) -> None:
-    """Write (H, W) or (H, W, 3) values in [0, 1] as 8 bits, sRGB-encoded unless ``linear``."""
-    if not np.all(np.isfinite(image)):
-        raise ValueError(f"refusing to write non-finite values to {path}")
-    data = np.clip(image, 0, 1) if linear else linear_to_srgb(np.asarray(image))
-    with atomic_path(path) as temporary:
-        Image.fromarray((data * 255 + 0.5).astype(np.uint8)).save(temporary, format="PNG")

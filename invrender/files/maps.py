@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from invrender.files.images import read_image, write_exr
+from invrender.files.images import read_image
+from invrender.files.write import write_exr
 from invrender.maps import NAMES, Maps
 from invrender.types import InputError
 
@@ -29,4 +30,4 @@ def read_maps(folder: Path) -> Maps:
 def write_maps(folder: Path, maps: Maps, *, half: bool = False) -> None:
     """Write the four EXR files into a folder."""
     for name, image in maps.encoded().items():
-        write_exr(Path(folder) / f"{name}.exr", image, half=half)
+        write_exr(Path(folder) / f"{name}.exr", image, half=half, data=name == "normal")

@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 from invrender.colour import linear_to_srgb
-from invrender.files.images import atomic_path
+from invrender.files.write import atomic_path
 from invrender.pattern.default import mirrored
 from invrender.sampling import resize_pattern
 from invrender.types import Array, InputError

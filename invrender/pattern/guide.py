@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from invrender.files.images import atomic_path
+from invrender.files.write import atomic_path
 from invrender.rig import Rig
 
 MM = 1 / 25.4  # inches

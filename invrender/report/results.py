@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from invrender.capture.lights import Lights
-from invrender.files.images import write_exr, write_png
+from invrender.colour import srgb_to_linear
 from invrender.files.maps import write_maps
+from invrender.files.write import write_exr, write_png
 from invrender.report.page import Report, report_html
 from invrender.types import Array
 
@@ -49,7 +50,7 @@ def write_results(
         write_maps(new, result.maps)
         sigma = deviations(result.sigma)
         for key, image in sigma.items():
-            write_exr(new / f"sigma_{key}.exr", image)
+            write_exr(new / f"sigma_{key}.exr", image, data=True)
         for key, image in result.maps.encoded().items():
             write_png(new / f"{key}.png", image, linear=key in ("normal", "roughness"))
         write_exr(new / "environment.exr", lights.environment)
@@ -57,7 +58,8 @@ def write_results(
         write_png(new / "photo.png", photo / white)
         write_png(new / "render.png", picture / white)
         # Grey where they agree; a tenth of white away from black or white.
-        write_png(new / "difference.png", 0.5 + 5 * (picture - photo) / white, linear=True)
+        difference = srgb_to_linear(0.5 + 5 * (picture - photo) / white)
+        write_png(new / "difference.png", difference)
         (new / "report.json").write_text(json.dumps(report.__dict__, indent=2) + "\n")
         page = report_html(
             report, result.maps, sigma, lights.environment, lights.pattern_captured, photo, picture

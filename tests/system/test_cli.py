@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from invrender.cli.main import EXAMPLE, main
-from invrender.files.images import read_image, write_exr
+from invrender.files.images import read_image
 from invrender.files.maps import read_maps
+from invrender.files.write import write_exr
 from invrender.maps import NAMES
 
 

@@ -14,8 +14,8 @@ from invrender.capture.orientation import oriented
 from invrender.capture.screen import SATURATED
 from invrender.cli.main import main
 from invrender.colour import linear_to_srgb
-from invrender.files.images import write_exr
 from invrender.files.rig_toml import write_rig
+from invrender.files.write import write_exr
 from invrender.pattern.default import default_pattern
 from invrender.rig import Rig
 

@@ -8,9 +8,9 @@ import synthetic_photo
 from synthetic_photo import blocks, grey_table, photograph
 
 from invrender.cli.main import main
-from invrender.files.images import write_exr
 from invrender.files.maps import write_maps
 from invrender.files.rig_toml import write_rig
+from invrender.files.write import write_exr
 from invrender.maps import constant_maps
 from invrender.pipeline import Stages, recover, refine_capture, see
 from invrender.render.renderer import render

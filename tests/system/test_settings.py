@@ -13,8 +13,8 @@ from synthetic_photo import blocks, photograph
 
 from invrender.cli.main import main
 from invrender.files.capture import load_capture
-from invrender.files.images import write_exr
 from invrender.files.rig_toml import _FILES, _KEYS, write_rig
+from invrender.files.write import write_exr
 from invrender.rig import Rig
 from invrender.types import InputError
 

@@ -9,8 +9,8 @@ import pytest
 from invrender import lpips, metrics
 from invrender.cli import compare as compare_cli
 from invrender.cli.main import EXAMPLE, main
-from invrender.files.images import write_exr, write_png
 from invrender.files.maps import read_maps, write_maps
+from invrender.files.write import write_exr, write_png
 from invrender.maps import constant_maps
 from invrender.render.point_lights import grid_lights, relight, rerender
 from invrender.rig import Rig

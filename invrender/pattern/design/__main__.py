@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from invrender.files.images import write_png
+from invrender.files.write import write_png
 from invrender.pattern.default import default_pattern
 from invrender.pattern.design.criterion import NAMES, Criterion
 from invrender.pattern.design.optimise import optimise, wheel

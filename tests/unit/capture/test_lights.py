@@ -22,8 +22,9 @@ from invrender.capture.orientation import find_upright_ball
 from invrender.capture.table import room_irradiance
 from invrender.colour import linear_to_srgb
 from invrender.files.capture import Capture, load_capture
-from invrender.files.images import Photo, read_photo, write_exr
+from invrender.files.images import Photo, read_photo
 from invrender.files.rig_toml import write_rig
+from invrender.files.write import write_exr
 from invrender.rig import Rig
 from invrender.sphere import directions, irradiance
 from invrender.types import InputError

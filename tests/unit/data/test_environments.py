@@ -12,7 +12,7 @@ from invrender.data.environments import (
     procedural_environment,
     read_environment,
 )
-from invrender.files.images import write_exr
+from invrender.files.write import write_exr
 from invrender.sphere import (
     directions,
     irradiance,

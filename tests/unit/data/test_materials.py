@@ -24,8 +24,8 @@ from invrender.data.materials import (
 from invrender.data.materials.files import material_files
 from invrender.data.materials.noise import Canvas, noise
 from invrender.data.materials.patterns import WEAVES, bricks, voronoi, weave
-from invrender.files.images import write_exr
 from invrender.files.maps import write_maps
+from invrender.files.write import write_exr
 from invrender.maps import Maps, constant_maps, resize_maps, rotate_maps, turn_maps
 from invrender.types import InputError
 

@@ -12,7 +12,8 @@ from PIL import Image
 
 from invrender.colour import linear_to_srgb, srgb_to_linear
 from invrender.files import images
-from invrender.files.images import read_image, read_photo, write_exr, write_png
+from invrender.files.images import read_image, read_photo
+from invrender.files.write import atomic_path, write_exr, write_png
 from invrender.types import InputError
 
 # Offset and step (x0, y0, dx, dy) of the seven passes of an interlaced PNG.
@@ -242,7 +243,7 @@ def test_damaged_files_never_crash(tmp_path, data):
 def test_failed_write_leaves_the_old_file(tmp_path):
     write_png(tmp_path / "a.png", np.zeros((4, 4, 3)))
     before = (tmp_path / "a.png").read_bytes()
-    with pytest.raises(RuntimeError), images.atomic_path(tmp_path / "a.png") as temporary:
+    with pytest.raises(RuntimeError), atomic_path(tmp_path / "a.png") as temporary:
         temporary.write_bytes(b"half")
         raise RuntimeError
     assert (tmp_path / "a.png").read_bytes() == before

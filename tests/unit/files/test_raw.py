@@ -7,8 +7,9 @@ import pytest
 import tifffile
 
 from invrender.files.capture import load_capture
-from invrender.files.images import read_image, read_photo, write_exr
+from invrender.files.images import read_image, read_photo
 from invrender.files.rig_toml import write_rig
+from invrender.files.write import write_exr
 from invrender.rig import Rig
 from invrender.types import InputError
 
