@@ -1,8 +1,8 @@
 """From simulated photographs to ball, lights and screen: how far off, how often, how fast.
 
-`python benchmarks/capture.py [--quick] --out DIR`. Of three photos two are HDR, one is a clipped
-JPEG; hand-held rigs, displays of other gamma, clutter, blur and noise as in `photos.py`. A quarter
-as many photos without a ball follow.
+Of three photos two are HDR, one is a clipped JPEG; hand-held rigs, displays of other gamma,
+clutter, blur and noise as in `benchmarks.common.photos`. A quarter as many photos without a ball
+follow.
 
 Irradiance is that of the room on nine points of the sample, with the screen in its way. The sample
 sees parts of the room that the screen hides from the ball; these can only be guessed, so that the
@@ -11,6 +11,7 @@ irradiance from what the ball sees is told as well. Poses are told relative to t
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import math
 import statistics
@@ -18,15 +19,12 @@ import time
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-from common import bar, markdown, write_results
-from photos import Shot, arguments, make_shot
 from scipy.spatial.transform import Rotation
 
+from benchmarks.common.photos import Shot, arguments, make_shot
+from benchmarks.common.results import bar, table, write_results
 from invrender.capture.ball import find_ball
 from invrender.capture.camera import corners
 from invrender.capture.lights import extract_lights
@@ -40,20 +38,18 @@ from invrender.types import InputError
 
 SEED = 3000  # photos from here on serve for nothing else
 SURE = 0.9  # confidence from which a wrong ball counts
-HEADER = [
-    "photo",
-    "kind",
-    "sample told",
-    "sample",
-    "centre",
-    "radius",
-    "irradiance",
-    "irradiance seen",
-    "gain",
-    "shift, mm",
-    "tilt, deg",
-    "s",
-]
+ERRORS = {
+    "sample told": "sample's corners by rig.toml, share of a side",
+    "sample": "sample's corners as found, share of a side",
+    "centre": "ball's centre, in radii",
+    "radius": "ball's radius",
+    "irradiance": "irradiance",
+    "irradiance seen": "irradiance, of what the ball sees",
+    "gain": "screen's light",
+    "shift, mm": "screen's shift, mm",
+    "tilt, deg": "screen's tilt, degrees",
+    "s": "processor seconds",
+}
 
 
 def measure(shot: Shot, kind: str) -> dict[str, Any]:
@@ -125,8 +121,11 @@ def big_photo() -> float:
     return time.process_time() - start
 
 
-def main() -> None:
-    args = arguments(__doc__, 60, "photos with a ball").parse_args()
+def parser() -> argparse.ArgumentParser:
+    return arguments(__doc__, 60, "photos with a ball")
+
+
+def main(args: argparse.Namespace) -> None:
     count = 9 if args.quick else args.count
     rows: list[dict[str, Any]] = []
     wrong: list[dict[str, Any]] = []
@@ -162,9 +161,12 @@ def main() -> None:
         "sample's corners, share of a side, median": median("sample"),
         "sample's corners within 1%": float(np.mean([r["sample"] <= 0.01 for r in rows])),
     }
-    write_results(args.out, {"bars": bars, **more, "photos": rows, "without a ball": wrong})
-    table = markdown(HEADER, [[r.get(k, "refused") for k in HEADER] for r in rows])
-    (args.out / "capture.md").write_text(table)
+    kinds = {"all": None, "HDR": "hdr", "JPEG": "jpeg"}
+    medians = [[e, *(median(n, k) for k in kinds.values())] for n, e in ERRORS.items()]
+    tables = {"medians": table(["error", *kinds], medians),
+              "counts": table(["", ""], [[k, float(v)] for k, v in more.items()])}  # fmt: skip
+    results = {"bars": bars, **more, "photos": rows, "without a ball": wrong}
+    write_results(args.out, results, tables)
     plot(args.out / "capture.png", rows)
 
 
@@ -182,7 +184,3 @@ def plot(path: Path, rows: list[dict[str, Any]]) -> None:
     figure.tight_layout()
     figure.savefig(path, dpi=120)
     plt.close(figure)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """Clipped lamps in a JPEG's ball: the room's irradiance when they are left, doubled, or raised.
 
-`python benchmarks/clipped.py [--quick] --out DIR [--rooms DIR]`. Photos as in `photos.py`; ball,
+Photos as in `benchmarks.common.photos`; ball,
 screen's pose and light as they are, so that nothing else errs; only photos with clipped lamps
 count. Error: mean over nine normals, relative. The lamps' excess in the rooms themselves, printed
 first, is to compare the prior in `invrender.capture.clipped_lamps` with. The formula of the
@@ -9,16 +9,17 @@ paper's code has no scale of its own: it is given that of the truth on the plane
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import markdown, write_results
 from numpy.typing import NDArray
-from photos import Shot, arguments, make_shot
-from refine_captures import HOLDOUT
 from scipy import ndimage
 
+from benchmarks.common.captures import HOLDOUT
+from benchmarks.common.photos import Shot, arguments, make_shot
+from benchmarks.common.results import table, write_results
 from invrender.capture.clipped_lamps import clipped_share, raise_clipped
 from invrender.capture.environment import fill_environment, unfold_environment
 from invrender.capture.mirror import make_ball
@@ -93,8 +94,11 @@ def measure(shot: Shot) -> dict[str, Any] | None:
     return row
 
 
-def main() -> None:
-    args = arguments(__doc__, 60, "photos with clipped lamps").parse_args()
+def parser() -> argparse.ArgumentParser:
+    return arguments(__doc__, 60, "photos with clipped lamps")
+
+
+def main(args: argparse.Namespace) -> None:
     prior = excess(args.rooms, 10 if args.quick else 60)
     print(
         "logarithm of the excess: mean {:.2f}, standard deviation {:.2f} ({} cases)".format(*prior)
@@ -109,18 +113,12 @@ def main() -> None:
             rows.append(row)
             print({k: round(v, 3) if isinstance(v, float) else v for k, v in row.items()})
     bad = [r for r in rows if r["left"] > 0.1]
-    table = []
+    lines: list[list[Any]] = []
     for name in METHODS:
         every, these = ([r[name] for r in some] for some in (rows, bad))
-        table.append(
+        lines.append(
             [name, np.median(every), np.mean(every), np.quantile(every, 0.9), np.median(these)]
         )
     header = ["lamps", "median", "mean", "90%", f"median of the {len(bad)} that lose over 10%"]
-    text = markdown(header, table)
-    print(text)
-    write_results(args.out, {"prior": prior, "photos": rows, "photographs tried": seed - SEED})
-    (args.out / "clipped.md").write_text(text)
-
-
-if __name__ == "__main__":
-    main()
+    results = {"prior": prior, "photos": rows, "photographs tried": seed - SEED}
+    write_results(args.out, results, {"irradiance": table(header, lines)})

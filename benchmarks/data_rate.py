@@ -1,7 +1,5 @@
 """Training captures a second, at 128² and 256², with the share of each part.
 
-    python benchmarks/data_rate.py --out DIR [--quick] [--materials DIR --envs DIR]
-
 One process, one thread; what counts is its own processor time, so that other work on the machine
 matters little. Shards are made by independent processes: n free cores make n times as many.
 """
@@ -10,11 +8,9 @@ from __future__ import annotations
 
 import argparse
 import time
-from pathlib import Path
 from typing import Any
 
-from common import bar, machine, markdown, write_results
-
+from benchmarks.common.results import bar, benchmark_parser, table, write_results
 from invrender.render.backend import dr
 from nets.training import dataset as data
 
@@ -65,30 +61,23 @@ def rate(size: int, count: int, materials: str, envs: str) -> dict[str, Any]:
     return {"seconds": (total - compiling) / count, "compiling": compiling / count, "parts": out}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--quick", action="store_true", help="few captures")
-    parser.add_argument("--materials", default="", help="folder of real materials")
-    parser.add_argument("--envs", default="", help="folder of real environments")
-    args = parser.parse_args()
-    args.out.mkdir(parents=True, exist_ok=True)
+def parser() -> argparse.ArgumentParser:
+    p = benchmark_parser(__doc__, "few captures")
+    p.add_argument("--materials", default="", help="folder of real materials")
+    p.add_argument("--envs", default="", help="folder of real environments")
+    return p
+
+
+def main(args: argparse.Namespace) -> None:
     data._single_thread()
     counts = {128: 8, 256: 4} if args.quick else {128: 96, 256: 48}
     found = {size: rate(size, count, args.materials, args.envs) for size, count in counts.items()}
-    m = machine()
     bars = [
         bar(f"captures a second at {size}², two cores", 2 / r["seconds"], BARS[size], True)
         for size, r in found.items()
     ]
     rows = [["all", *(r["seconds"] for r in found.values())]]
     rows += [[k, *(r["parts"][k] for r in found.values())] for k in found[128]["parts"]]
-    text = f"# Training captures\n\n{m['cpu']}. Processor seconds a capture:\n\n"
-    text += markdown(["", *(f"{size}²" for size in found)], rows)
-    (args.out / "data_rate.md").write_text(text)
-    print(text)
-    write_results(args.out, {"rates": {str(k): v for k, v in found.items()}, "bars": bars})
-
-
-if __name__ == "__main__":
-    main()
+    parts = table(["processor seconds a capture", *(f"{size}²" for size in found)], rows)
+    results = {"rates": {str(k): v for k, v in found.items()}, "bars": bars}
+    write_results(args.out, results, {"parts": parts})

@@ -1,30 +1,24 @@
 """Procedural materials and environments beside real ones: sheets to look at, statistics, timings.
 
-    python benchmarks/data_statistics.py --materials DIR --envs DIR --out DIR [--quick]
-
 Writes procedural.png, real.png, environments.png (each cell of the first two: lit from the front
-left; beside it albedo, specular, roughness, normal), histograms.png, statistics.md and
-results.json, whose ``bars`` hold {name, value, bar, ok}. Both folders are optional.
+left; beside it albedo, specular, roughness, normal) and histograms of both. The folders of real
+materials and rooms are optional.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-import platform
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import ks_2samp
 
+from benchmarks.common.results import Table, bar, benchmark_parser, table, write_results
 from invrender.data.environments import (
     KINDS,
     find_environments,
@@ -45,8 +39,9 @@ from invrender.sphere import irradiance, solid_angles
 from invrender.types import InputError
 
 Array = NDArray[np.floating[Any]]
-Table = dict[str, Array]
+Statistics = dict[str, Array]
 QUANTILES = (5, 25, 50, 75, 95)
+SOURCES = ("procedural", "real")
 
 
 # --- statistics -----------------------------------------------------------------------------------
@@ -119,11 +114,11 @@ def environment_statistics(env: Array) -> dict[str, float]:
     }
 
 
-def _table(rows: list[dict[str, float]]) -> Table:
+def _by_name(rows: list[dict[str, float]]) -> Statistics:
     return {k: np.array([r[k] for r in rows]) for k in rows[0]} if rows else {}
 
 
-def compare(made: Table, real: Table) -> list[dict[str, Any]]:
+def compare(made: Statistics, real: Statistics) -> list[dict[str, Any]]:
     """Quantiles of both, the Kolmogorov–Smirnov distance, and how much of the real is covered."""
     lines = []
     for key, values in made.items():
@@ -140,17 +135,14 @@ def compare(made: Table, real: Table) -> list[dict[str, Any]]:
     return lines
 
 
-def markdown(title: str, lines: list[dict[str, Any]]) -> str:
+def compared(lines: list[dict[str, Any]]) -> Table:
     """The comparison as a table."""
-    text = f"### {title}\n\n| | procedural 5 / 25 / 50 / 75 / 95% | real | KS | covered |\n"
-    text += "| --- | --- | --- | --- | --- |\n"
+    rows = []
     for line in lines:
-        made = " / ".join(f"{v:.3g}" for v in line["procedural"])
-        real = " / ".join(f"{v:.3g}" for v in line.get("real", []))
-        ks = f"{line['ks']:.2f}" if "ks" in line else ""
-        covered = f"{line['covered']:.0%}" if "covered" in line else ""
-        text += f"| {line['name']} | {made} | {real} | {ks} | {covered} |\n"
-    return text
+        made, real = (" / ".join(f"{v:.3g}" for v in line.get(k, [])) for k in SOURCES)
+        rows.append([line["name"], made, real, line.get("ks"), line.get("covered")])
+    header = ["", "procedural, 5 / 25 / 50 / 75 / 95%", "real, the same", "KS distance", "covered"]
+    return table(header, rows)
 
 
 # --- pictures -------------------------------------------------------------------------------------
@@ -208,7 +200,7 @@ def sheet(cells: list[Array], columns: int) -> Array:
     return out
 
 
-def histograms(path: Path, made: Table, real: Table) -> None:
+def histograms(path: Path, made: Statistics, real: Statistics) -> None:
     """A plot of each statistic, procedural beside real."""
     columns = 6
     rows = -(-len(made) // columns)
@@ -272,74 +264,70 @@ def degenerate(maps: Maps) -> bool:
     return False
 
 
-def run(arguments: argparse.Namespace) -> dict[str, Any]:
-    """All of it; returns what results.json holds."""
-    out: Path = arguments.out
-    out.mkdir(parents=True, exist_ok=True)
-    size, count = arguments.size, 150 if arguments.quick else arguments.count
-    seeds = range(arguments.seed, arguments.seed + count)
-    bars: list[dict[str, Any]] = []
+def parser() -> argparse.ArgumentParser:
+    p = benchmark_parser(__doc__, "fewer samples")
+    p.add_argument("--materials", type=Path, help="folder of real material folders")
+    p.add_argument("--envs", type=Path, help="folder of real environments")
+    p.add_argument("--count", type=int, default=800, help="procedural materials")
+    p.add_argument("--size", type=int, default=128)
+    p.add_argument("--seed", type=int, default=0)
+    return p
 
-    def bar(name: str, value: float, limit: float, below: bool = True) -> None:
-        ok = value <= limit if below else value >= limit
-        bars.append({"name": name, "value": value, "bar": limit, "ok": bool(ok)})
-        print(f"{'ok  ' if ok else 'MISS'} {name}: {value:.3g} (bar {limit:g})")
+
+def main(args: argparse.Namespace) -> None:
+    out: Path = args.out
+    out.mkdir(parents=True, exist_ok=True)
+    size, count = args.size, 150 if args.quick else args.count
+    seeds = range(args.seed, args.seed + count)
 
     times = milliseconds(lambda s: procedural_material(s, size, size), seeds)
-    bar(f"procedural material {size}², median ms of one core", float(np.median(times[:, 1])), 20)
     made = [procedural_material(s, size, size) for s in seeds]
-    bar("degenerate procedural materials", sum(map(degenerate, made)), 0)
-    made_table = _table([material_statistics(m) for m in made])
-    per_kind = 3 if arguments.quick else 6
+    bars = [
+        bar(f"procedural material {size}², median ms of one core",
+            float(np.median(times[:, 1])), 20, False),
+        bar("degenerate procedural materials", sum(map(degenerate, made)), 0, False),
+    ]  # fmt: skip
+    made_table = _by_name([material_statistics(m) for m in made])
+    per_kind = 3 if args.quick else 6
     shown = [procedural_material(s, size, size, k) for k in PRESETS for s in range(per_kind)]
     write_png(out / "procedural.png", sheet([cell(m) for m in shown], 6))
 
-    real_table: Table = {}
-    report = ""
-    if arguments.materials:
-        rng = np.random.default_rng(arguments.seed)
+    real_table: Statistics = {}
+    if args.materials:
+        rng = np.random.default_rng(args.seed)
         rows, cells, wrong = [], [], 0
-        for _, maps in load_materials(arguments.materials, 512):
+        for _, maps in load_materials(args.materials, 512):
             wrong += is_directx(maps.normal)
             cells.append(cell(maps))
-            for _ in range(1 if arguments.quick else 3):
+            for _ in range(1 if args.quick else 3):
                 piece = augment(maps, rng, size, size, jitter=0, free_rotation=0)
                 rows.append(material_statistics(piece))
-        real_table = _table(rows)
+        real_table = _by_name(rows)
         write_png(out / "real.png", sheet(cells, 6))
-        bar("OpenGL normals taken for DirectX", wrong, 0)
+        bars.append(bar("OpenGL normals taken for DirectX", wrong, 0, False))
     lines = compare(made_table, real_table)
     if real_table:
-        bar(
-            "real materials inside the procedural range, worst statistic",
-            min(line["covered"] for line in lines),
-            0.8,
-            below=False,
-        )
-        bar("mean KS distance, procedural to real", float(np.mean([x["ks"] for x in lines])), 0.35)
-    report += markdown("Materials", lines)
+        covered, distance = min(x["covered"] for x in lines), np.mean([x["ks"] for x in lines])
+        bars += [
+            bar("real materials inside the procedural range, worst statistic", covered, 0.8, True),
+            bar("mean KS distance, procedural to real", float(distance), 0.35, False),
+        ]
     histograms(out / "histograms.png", made_table, real_table)
 
-    envs = 40 if arguments.quick else 160
+    envs = 40 if args.quick else 160
     env_times = milliseconds(lambda s: procedural_environment(s, 128), range(min(envs, 40)))
     rooms = [procedural_environment(s, 128) for s in range(envs)]
-    env_table = _table([environment_statistics(e) for e in rooms])
+    env_table = _by_name([environment_statistics(e) for e in rooms])
     cells = [_shown(procedural_environment(s, 64, k)) for k in KINDS for s in range(6)]
-    real_env: Table = {}
-    if arguments.envs:
-        found = [read_environment(p, 128) for p in find_environments(arguments.envs)]
-        real_env = _table([environment_statistics(e) for e in found])
-        cells += [_shown(read_environment(p, 64)) for p in find_environments(arguments.envs)]
+    real_env: Statistics = {}
+    if args.envs:
+        found = [read_environment(p, 128) for p in find_environments(args.envs)]
+        real_env = _by_name([environment_statistics(e) for e in found])
+        cells += [_shown(read_environment(p, 64)) for p in find_environments(args.envs)]
     write_png(out / "environments.png", sheet(cells, 6))
     histograms(out / "environment_histograms.png", env_table, real_env)
     env_lines = compare(env_table, real_env)
-    report += "\n" + markdown("Environments (above the table)", env_lines)
-    (out / "statistics.md").write_text(report)
-    print("\n" + report)
     results = {
-        "machine": platform.processor() or platform.machine(),
-        "python": platform.python_version(),
-        "numpy": np.__version__,
         "procedural": count,
         "real": len(next(iter(real_table.values()))) if real_table else 0,
         "material_ms": _times(times),
@@ -348,27 +336,10 @@ def run(arguments: argparse.Namespace) -> dict[str, Any]:
         "environments": env_lines,
         "bars": bars,
     }
-    (out / "results.json").write_text(json.dumps(results, indent=1))
-    return results
+    tables = {"materials": compared(lines), "environments above the table": compared(env_lines)}
+    write_results(out, results, tables)
 
 
 def _shown(env: Array) -> Array:
     """An environment exposed for its walls."""
     return np.clip(env / (np.percentile(env.mean(-1), 85) * 1.2), 0, 1)
-
-
-def main() -> None:
-    """Parse the command line and run."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--materials", type=Path, help="folder of real material folders")
-    parser.add_argument("--envs", type=Path, help="folder of real environments")
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--quick", action="store_true", help="fewer samples")
-    parser.add_argument("--count", type=int, default=800, help="procedural materials")
-    parser.add_argument("--size", type=int, default=128)
-    parser.add_argument("--seed", type=int, default=0)
-    run(parser.parse_args())
-
-
-if __name__ == "__main__":
-    main()

@@ -1,30 +1,24 @@
 """The forward model against general renderers: error, and error of gradients, over time.
 
-    python benchmarks/forward.py --out DIR [--quick]
-
-Writes forward.md (tables), forward.png (RMS error against seconds, a panel a scene) and
-results.json, whose ``bars`` hold {name, value, bar, ok}. All times are warm medians of one run on
-one machine; compilation and `prepare` are reported beside them. Where a Monte Carlo method would
+All times are warm medians of one run on one machine; compilation and `prepare` are reported beside
+them. forward.png has RMS error against seconds, a panel a scene. Where a Monte Carlo method would
 take minutes, its time is extrapolated from its last two measurements' mean by 1/√N. What a kernel
-costs, and the fast estimator's bias, are in forward_cost.py.
+costs, and the fast estimator's bias, are in `forward_cost`.
 """
 
 from __future__ import annotations
 
 import argparse
 import statistics
-from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
-from common import bar, machine, markdown, timed, write_results
-from forward_gradients import forward_backward, measure_gradients
-from scenes import GAIN, RIG, SCENES, Array, Case, averaged, curve, time_to
 
+from benchmarks.common.gradients import forward_backward, measure_gradients
+from benchmarks.common.plot import plot_error_over_time
+from benchmarks.common.results import bar, benchmark_parser, table, write_results
+from benchmarks.common.scenes import GAIN, RIG, SCENES, Array, Case, averaged, curve, time_to
+from benchmarks.common.timing import timed
 from invrender.render.backend import dr
 
 
@@ -51,7 +45,8 @@ def measure_values(case: Case, quick: bool) -> dict[str, Any]:
     }
     try:
         import torch
-        from torch_forward import TorchScene
+
+        from benchmarks.common.torch_forward import TorchScene
 
         torch.set_num_threads(dr.thread_count())
         scene = TorchScene(RIG, case.maps, case.pattern, case.environment, GAIN)
@@ -68,32 +63,14 @@ def measure_values(case: Case, quick: bool) -> dict[str, Any]:
     return {"methods": out, "reference_noise": float(np.sqrt(noise2) / mean), "prepare": prepare}
 
 
-def plot(results: dict[str, Any], path: Path) -> None:
-    """A panel a scene, a curve a method; both axes logarithmic."""
-    figure, axes = plt.subplots(2, 3, figsize=(13, 8), squeeze=False)
-    for axis, (name, r) in zip(axes.ravel(), results.items(), strict=False):
-        for method, c in r["methods"].items():
-            axis.loglog(c["seconds"], c["errors"], "o-", ms=3, label=method)
-        axis.axhline(0.02, color="0.7", lw=0.8)
-        axis.axhline(0.01, color="0.7", lw=0.8, ls=":")
-        axis.set_title(name)
-        axis.set_xlabel("seconds")
-        axis.set_ylabel("RMS error / mean")
-        axis.grid(alpha=0.2)
-    axes[0, 0].legend()
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-
-
 STATISTICAL = {"fast": False, "mis": True, "path": True, "direct": True, "torch": True}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--quick", action="store_true", help="small, few: ends within a minute")
-    args = parser.parse_args()
+def parser() -> argparse.ArgumentParser:
+    return benchmark_parser(__doc__, "one small scene, few samples")
+
+
+def main(args: argparse.Namespace) -> None:
     quick = args.quick
     n = 64 if quick else 256
     names = ["glossy"] if quick else list(SCENES)
@@ -131,7 +108,11 @@ def main() -> None:
              min(curves["prb"]["cosines"]), g["reference_noise"]]
         )  # fmt: skip
         print(*rows[-1], "| gradients", *gradient_rows[-1][1:], flush=True)
-    plot(values, args.out / "forward.png")
+    panels = {
+        name: {m: (c["seconds"], c["errors"]) for m, c in r["methods"].items()}
+        for name, r in values.items()
+    }
+    plot_error_over_time(args.out / "forward.png", panels, y="RMS / mean", levels=(0.02, 0.01))
 
     def ratio(a: str, b: str) -> float:
         return statistics.median(r["seconds_to"][a] / r["seconds_to"][b] for r in values.values())
@@ -154,21 +135,13 @@ def main() -> None:
         bar(f"seconds of {n}² at 2%, fast",
             statistics.median(r["seconds_to"]["fast 2%"] for r in values.values()), 0.1, False),
     ]  # fmt: skip
-    m = machine()
-    versions = ", ".join(f"{k} {v}" for k, v in m["versions"].items())
-    text = f"# Forward model\n\n{m['cpu']}, {m['cores']} cores, {versions}; {n}² pixels.\n\n"
-    text += "Seconds to an RMS error, of the mean radiance:\n\n" + markdown(
-        ["scene", "fast 2%", "path 2%", "direct 2%", "mis 1%", "path 1%", "torch 2%",
-         "prepare fast", "prepare mis", "fast cold", "reference's noise"], rows)  # fmt: skip
-    text += "\nSeconds to 10% error of the maps' gradients (mean relative norm of the four):\n\n"
-    text += markdown(
-        ["scene", "fast", "mis", "prb", "fast at most samples", "its least cosine",
-         "prb's least cosine", "reference's noise"], gradient_rows)  # fmt: skip
-    text += "\n" + markdown(["bar", "value", "target", "ok"], [list(b.values()) for b in bars])
-    (args.out / "forward.md").write_text(text)
-    results = {"values": values, "gradients": gradients, "forward_backward": both}
-    write_results(args.out, {**results, "bars": bars})
-
-
-if __name__ == "__main__":
-    main()
+    image = table(
+        ["seconds to an RMS error of", "fast 2%", "path 2%", "direct 2%", "mis 1%", "path 1%",
+         "torch 2%", "prepare fast", "prepare mis", "fast cold", "reference's noise"],
+        rows,
+    )  # fmt: skip
+    ten_percent = table(
+        ["seconds to 10% error of the gradients", "fast", "mis", "prb", "fast at most samples",
+         "its least cosine", "prb's least cosine", "reference's noise"], gradient_rows)  # fmt: skip
+    results = {"values": values, "gradients": gradients, "forward_backward": both, "bars": bars}
+    write_results(args.out, results, {"image": image, "gradients": ten_percent})

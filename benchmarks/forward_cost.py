@@ -1,10 +1,8 @@
 """What the forward model costs and how far its fast estimator is off.
 
-    python benchmarks/forward_cost.py --out DIR [--quick]
-
 Kernel sizes and times by what a scene has; samples and floating-point operations a second, against
 what this machine reaches; memory of a 4096² render; bias of the fast estimator over samples.
-Writes forward_cost.md, forward_cost.png (bias over samples) and results.json.
+forward_cost.png has the bias over samples.
 """
 
 from __future__ import annotations
@@ -17,17 +15,22 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
-from common import bar, machine, markdown, write_results
-from scenes import GAIN, RIG, SCENES, Array, Case, averaged, make_environment, make_maps
 
+from benchmarks.common.plot import plot_error_over_time
+from benchmarks.common.results import bar, benchmark_parser, table, write_results
+from benchmarks.common.scenes import (
+    GAIN,
+    RIG,
+    SCENES,
+    Array,
+    Case,
+    averaged,
+    make_environment,
+    make_maps,
+)
 from invrender.maps import Maps
 from invrender.render import renderer as render
 from invrender.render.backend import Float, UInt, dr
@@ -192,7 +195,17 @@ def work(n: int, samples: int, rounds: int) -> dict[str, float]:
 
 def memory(n: int, samples: int) -> dict[str, float]:
     """Peak memory (GB) and seconds of an n² render in a process of its own."""
-    command = [sys.executable, __file__, "--out", ".", "--render", str(n), str(samples)]
+    command = [
+        sys.executable,
+        "-m",
+        "benchmarks",
+        "forward_cost",
+        "--out",
+        ".",
+        "--render",
+        str(n),
+        str(samples),
+    ]
     out = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
     before, peak, seconds = map(float, out)
     return {"pixels a side": n, "GB": peak, "of it maps and program": before, "seconds": seconds}
@@ -235,26 +248,13 @@ def bias(name: str, n: int, counts: list[int], quick: bool) -> dict[str, Any]:
     }
 
 
-def plot(results: dict[str, Any], path: Path) -> None:
-    """Bias over samples, a curve a scene."""
-    figure, axis = plt.subplots(figsize=(6, 4.5))
-    for name, r in results.items():
-        (line,) = axis.loglog(r["samples"], np.maximum(r["errors"], 1e-5), "o-", ms=3, label=name)
-        axis.plot(r["samples"][-1] * 1.15, max(r["detailed"], 1e-5), "s", ms=4, c=line.get_color())
-    axis.set(xlabel="samples a pixel (squares: tables of twice the size)", ylabel="RMS / mean")
-    axis.grid(alpha=0.2)
-    axis.legend(fontsize=8)
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+def parser() -> argparse.ArgumentParser:
+    p = benchmark_parser(__doc__, "small, few samples")
+    p.add_argument("--render", type=int, nargs=2, help=argparse.SUPPRESS)
+    return p
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--quick", action="store_true", help="small, few: ends within a minute")
-    parser.add_argument("--render", type=int, nargs=2, help=argparse.SUPPRESS)
-    args = parser.parse_args()
+def main(args: argparse.Namespace) -> None:
     if args.render:
         render_once(*args.render)
         return
@@ -266,24 +266,23 @@ def main() -> None:
     counts = [16, 64] if quick else [4, 16, 64, 256, 1024, 4096]
     names = list(SCENES)[:2] if quick else list(SCENES)
     off = {k: bias(k, 32 if quick else 64, counts, quick) for k in names}
-    plot(off, args.out / "forward_cost.png")
+    curves = {k: (r["samples"], r["errors"]) for k, r in off.items()}
+    curves |= {
+        f"{k}, tables twice as large": (r["samples"][-1:], [r["detailed"]]) for k, r in off.items()
+    }
+    panel = {"difference of fast from mis": curves}
+    plot_error_over_time(args.out / "forward_cost.png", panel, x="samples a pixel", y="RMS / mean")
     bars = [bar("GB of a 4096² render", used["GB"], LIMIT, False)] if not quick else []
-    m = machine()
-    versions = ", ".join(f"{k} {v}" for k, v in m["versions"].items())
-    text = f"# Cost of the forward model\n\n{m['cpu']}, {m['cores']} cores, {versions}.\n\n"
-    text += f"What a scene lacks costs nothing ({n}², {16 if quick else 64} samples):\n\n"
-    text += markdown(["scene", "operations", "seconds", "with gradients", "seconds"], special)
-    text += "\n" + markdown(["the specular loop", ""], [[k, v] for k, v in effort.items()])
-    text += "\n" + markdown(["a large render", ""], [[k, float(v)] for k, v in used.items()])
-    text += "\nRMS difference of `fast` from the converged `mis`, of the mean radiance:\n\n"
+    fixed = ["scene", *(f"{k} samples" for k in counts), "tables twice as large", "noise"]
     rows = [[k, *r["errors"], r["detailed"], r["reference_noise"]] for k, r in off.items()]
-    header = ["scene", *(f"{k} samples" for k in counts), "tables twice as large", "noise"]
-    text += markdown(header, rows)
-    (args.out / "forward_cost.md").write_text(text)
-    print(text)
+    tables = {
+        "what a scene lacks": table(
+            ["scene", "operations", "seconds", "operations with gradients", "their seconds"],
+            special,
+        ),
+        "the specular loop": table(["", ""], [[k, v] for k, v in effort.items()]),
+        "a large render": table(["", ""], [[k, v] for k, v in used.items()]),
+        "difference of fast from mis": table(fixed, rows),
+    }
     results = {"specialisation": special, "work": effort, "memory": used, "bias": off}
-    write_results(args.out, {**results, "bars": bars})
-
-
-if __name__ == "__main__":
-    main()
+    write_results(args.out, {**results, "bars": bars}, tables)

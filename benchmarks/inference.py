@@ -1,7 +1,5 @@
 """Error of the initial maps against the time they take, for the networks' presets.
 
-    python benchmarks/inference.py --out DIR [--quick] [--weights FILE ...] [--valid NAME=DIR ...]
-
 Seconds of one sample of 256 × 256 pixels, lights and clues included, median of several; each
 network's error on folders of `nets.training.dataset` (see docs/networks.md), without them and with
 --quick on a few small procedural captures. Presets without weights are timed alone.
@@ -15,9 +13,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from common import markdown, timed, write_results
-from matplotlib import pyplot as plt
 
+from benchmarks.common.plot import plot_error_over_time
+from benchmarks.common.results import benchmark_parser, table, write_results
+from benchmarks.common.timing import timed
 from invrender.data.environments import procedural_environment
 from invrender.pattern.default import default_pattern
 from invrender.rig import Rig
@@ -42,13 +41,14 @@ def millions(network: torch.nn.Module) -> float:
     return sum(x.numel() for x in network.parameters()) / 1e6
 
 
-def main() -> None:
-    p = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    p.add_argument("--out", type=Path, required=True)
-    p.add_argument("--quick", action="store_true", help="a few captures, a few repetitions")
+def parser() -> argparse.ArgumentParser:
+    p = benchmark_parser(__doc__, "a few captures, a few repetitions")
     p.add_argument("--weights", type=Path, nargs="*", default=[WEIGHTS / "small.safetensors"])
     p.add_argument("--valid", nargs="*", default=[], metavar="NAME=DIR")
-    args = p.parse_args()
+    return p
+
+
+def main(args: argparse.Namespace) -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     if args.quick or not args.valid:
         write_shard(args.out, 0, Options(size=32, samples=8, split="holdout"), 16)
@@ -70,30 +70,14 @@ def main() -> None:
         fresh, file = build(name), args.out / f"untrained_{name}.safetensors"
         save_weights(file, fresh, {})
         time = seconds(Reconstructor(file), repeats)
-        rows.append([name, millions(fresh), time, "untrained", *[""] * 5])
+        rows.append([name, millions(fresh), time, "untrained", *[None] * 5])
         file.unlink()
     for k, folder in sets.items():
         guess = baseline(folder, 128)
-        rows.append(["a constant guess", "", "", k, *(guess[m] for m in (*MAPS, "average"))])
+        rows.append(["a constant guess", None, None, k, *(guess[m] for m in (*MAPS, "average"))])
     header = ["network", "million parameters", "seconds", "set", *MAPS, "average"]
-    (args.out / "inference.md").write_text(markdown(header, rows))
-
-    figure, axis = plt.subplots(figsize=(6, 4))
-    for k in sets:
-        axis.plot([s for _, s, _ in points], [e[k]["average"] for *_, e in points], "o", label=k)
-    for name, s, errors in points:
-        axis.annotate(name, (s, max(e["average"] for e in errors.values())), xytext=(4, 4),
-                      textcoords="offset points")  # fmt: skip
-    for name, _, s, kind, *_ in rows:
-        if kind == "untrained":
-            axis.axvline(s, color="grey", ls=":", label=f"{name} (no weights)")
-    top = 1.2 * max(e["average"] for *_, errors in points for e in errors.values())
-    axis.set(xscale="log", ylim=(0, top), xlabel=f"seconds for {SIZE}²", ylabel="average RMSE")
-    axis.legend(fontsize=7)
-    figure.tight_layout()
-    figure.savefig(args.out / "inference.png", dpi=120)
-    write_results(args.out, {"rows": rows, "bars": []})
-
-
-if __name__ == "__main__":
-    main()
+    panel = {k: {name: ([s], [e[k]["average"]]) for name, s, e in points} for k in sets}
+    plot_error_over_time(
+        args.out / "inference.png", panel, x=f"seconds for {SIZE}²", y="average map RMSE"
+    )
+    write_results(args.out, {"bars": []}, {"networks": table(header, rows)})

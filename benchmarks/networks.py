@@ -1,7 +1,5 @@
 """Ablations of the network at equal steps: validation error against training time.
 
-    python benchmarks/networks.py --out DIR [--quick] [--data DIR --valid NAME=DIR ...]
-
 Every variant sees the same captures in the same order, from the same seed. ``--data`` and
 ``--valid`` are folders of `nets.training.dataset` (see docs/networks.md); without them, and with
 --quick, a few procedural captures are made first. Training goes on where an earlier run stopped.
@@ -14,13 +12,13 @@ import csv
 from pathlib import Path
 from typing import Any
 
-from common import bar, markdown, write_results
-from matplotlib import pyplot as plt
-
+from benchmarks.common.plot import plot_error_over_time
+from benchmarks.common.results import bar, benchmark_parser, table, write_results
 from nets.model import MAPS
 from nets.training.dataset import write_shard
 from nets.training.draw import Options
-from nets.training.train import baseline, parser, train
+from nets.training.train import baseline, train
+from nets.training.train import parser as train_parser
 
 VARIANTS = {
     "no clues (LPL+)": ("none", "off", "off", "off", "off"),
@@ -48,7 +46,7 @@ def train_variant(name: str, args: argparse.Namespace) -> list[dict[str, float]]
     """Train a variant and return its log."""
     out = args.out / "runs" / name.replace(" ", "-").strip("+-").replace("(", "").replace(")", "")
     clues, active, slopes, lobes, denoiser = VARIANTS[name]
-    options = parser().parse_args([
+    options = train_parser().parse_args([
         "--data", str(args.data), "--out", str(out), "--valid", *args.valid,
         "--preset", args.preset, "--clues", clues, "--active", active, "--slopes", slopes,
         "--lobes", lobes, "--denoiser", denoiser,
@@ -61,10 +59,8 @@ def train_variant(name: str, args: argparse.Namespace) -> list[dict[str, float]]
         return [{k: float(v) for k, v in row.items()} for row in csv.DictReader(f)]
 
 
-def main() -> None:
-    p = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    p.add_argument("--out", type=Path, required=True)
-    p.add_argument("--quick", action="store_true", help="a few steps on a few captures")
+def parser() -> argparse.ArgumentParser:
+    p = benchmark_parser(__doc__, "a few steps on a few captures")
     p.add_argument("--data", type=Path)
     p.add_argument("--valid", nargs="*", default=[], metavar="NAME=DIR")
     p.add_argument("--preset", default="tiny")
@@ -74,7 +70,10 @@ def main() -> None:
     p.add_argument("--batch", type=int, default=8)
     p.add_argument("--threads", type=int, default=1)
     p.add_argument("--device", default="cpu")
-    args = p.parse_args()
+    return p
+
+
+def main(args: argparse.Namespace) -> None:
     args.every = max(args.steps // 10, 1)
     args.out.mkdir(parents=True, exist_ok=True)
     if args.quick or args.data is None:
@@ -88,7 +87,7 @@ def main() -> None:
     bars = []
     for valid, folder in sets.items():
         constant = baseline(Path(folder), 96)
-        rows.append([valid, "a constant guess", "", *(constant[k] for k in (*MAPS, "average"))])
+        rows.append([valid, "a constant guess", None, *(constant[k] for k in (*MAPS, "average"))])
         for name, log in logs.items():
             last = log[-1]
             errors = [last[f"{valid}_{k}"] for k in (*MAPS, "average")]
@@ -98,21 +97,15 @@ def main() -> None:
             name = f"average map RMSE, ours over no clues, {valid}"
             bars.append(bar(name, ratio, 0.84, at_least=False))
     header = ["set", "variant", "seconds", *MAPS, "average"]
-    (args.out / "networks.md").write_text(markdown(header, rows))
-
-    figure, axes = plt.subplots(1, len(sets), figsize=(6 * len(sets), 4), squeeze=False)
-    for axis, valid in zip(axes[0], sets, strict=True):
-        for name, log in logs.items():
-            x = [row["seconds"] for row in log]
-            axis.plot(x, [row[f"{valid}_average"] for row in log], ".-", label=name)
-        axis.set(xscale="log", yscale="log", xlabel="seconds of training", ylabel="average RMSE")
-        axis.set_title(valid)
-    axes[0][0].legend(fontsize=7)
-    figure.tight_layout()
-    figure.savefig(args.out / "networks.png", dpi=120)
-    result = {"rows": rows, "steps": args.steps, "preset": args.preset, "bars": bars}
-    write_results(args.out, result)
-
-
-if __name__ == "__main__":
-    main()
+    panels = {
+        valid: {
+            name: ([r["seconds"] for r in log], [r[f"{valid}_average"] for r in log])
+            for name, log in logs.items()
+        }
+        for valid in sets
+    }
+    plot_error_over_time(
+        args.out / "networks.png", panels, x="seconds of training", y="average map RMSE"
+    )
+    result = {"logs": logs, "steps": args.steps, "preset": args.preset, "bars": bars}
+    write_results(args.out, result, {"errors": table(header, rows)})

@@ -1,9 +1,7 @@
-"""The light pattern: expected map errors under several patterns, the optimiser's convergence, and
-the errors of one small network trained under white and under the default pattern.
+"""The light pattern: expected map errors under several patterns, and the optimiser's convergence.
 
-    python benchmarks/pattern.py [--quick] --out DIR [--networks [--materials DIR --envs DIR]]
-
-Everything is measured on a population of pixels and rooms that no search has seen.
+With ``--networks`` also the errors of one small network trained under white and under the default
+pattern. Everything is measured on a population of pixels and rooms that no search has seen.
 """
 
 from __future__ import annotations
@@ -18,10 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import bar, markdown, write_results
 from matplotlib import pyplot as plt
 from numpy.typing import NDArray
 
+from benchmarks.common.plot import plot_error_over_time
+from benchmarks.common.results import bar, benchmark_parser, table, write_results
 from invrender.colour import linear_to_srgb
 from invrender.files.images import read_image
 from invrender.files.write import write_exr
@@ -123,29 +122,23 @@ def networks(args: argparse.Namespace, patterns: dict[str, Array]) -> dict[str, 
 def plot(
     out: Path, patterns: dict[str, Array], errors: dict[str, Any], curves: dict[str, Any]
 ) -> None:
-    """patterns.png: each pattern over its criterion; convergence.png."""
+    """pattern.png: each pattern over its criterion; pattern_convergence.png."""
     figure, axes = plt.subplots(1, len(patterns), figsize=(2.1 * len(patterns), 2.7))
     for ax, (name, pattern) in zip(axes, patterns.items(), strict=True):
         ax.imshow(linear_to_srgb(resize_pattern(pattern, 128)))
         ax.set_title(f"{name}\n{errors[name]['criterion']:.3f}", fontsize=10)
         ax.axis("off")
     figure.tight_layout()
-    figure.savefig(out / "patterns.png", dpi=60)
+    figure.savefig(out / "pattern.png", dpi=60)
     plt.close(figure)
-    figure, ax = plt.subplots(figsize=(6, 4))
-    for name, curve in curves.items():
-        ax.loglog(*zip(*[(max(t, 0.1), c) for t, c in curve], strict=True), ".-", label=name)
-    ax.set(xlabel="seconds", ylabel="criterion, held-out population")
-    ax.legend()
-    figure.tight_layout()
-    figure.savefig(out / "convergence.png", dpi=80)
-    plt.close(figure)
+    panel: Any = {name: tuple(zip(*curve, strict=True)) for name, curve in curves.items()}
+    plot_error_over_time(
+        out / "pattern_convergence.png", {"held-out population": panel}, y="criterion"
+    )
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--quick", action="store_true", help="small populations, few iterations")
+def parser() -> argparse.ArgumentParser:
+    parser = benchmark_parser(__doc__, "small populations, few iterations")
     parser.add_argument("--pattern", type=Path, nargs="*", default=[], help="more to compare")
     parser.add_argument("--networks", action="store_true", help="train networks too (an hour)")
     parser.add_argument("--materials", default="", help="folder of materials for the networks")
@@ -153,7 +146,10 @@ def main() -> None:
     parser.add_argument("--captures", type=int, default=1024)
     parser.add_argument("--steps", type=int, default=800)
     parser.add_argument("--seeds", type=int, default=1)
-    args = parser.parse_args()
+    return parser
+
+
+def main(args: argparse.Namespace) -> None:
     args.out.mkdir(parents=True, exist_ok=True)
 
     rig, groups = Rig(), 64 if args.quick else 480
@@ -163,10 +159,9 @@ def main() -> None:
     seconds = time.perf_counter() - begin
     patterns = candidates(args.pattern)
     errors = {k: held_out.errors(p) for k, p in patterns.items()}
-    table = [[k, *(e[m] for m in (*NAMES, "criterion"))] for k, e in errors.items()]
-    table.append(["(prior)", *np.sqrt(held_out.prior_mse).tolist(), 1.0])
-    text = markdown(["pattern", *NAMES, "criterion"], table)
-    print(text)
+    lines = [[k, *(e[m] for m in (*NAMES, "criterion"))] for k, e in errors.items()]
+    lines.append(["(prior)", *np.sqrt(held_out.prior_mse).tolist(), 1.0])
+    tables = {"expected errors": table(["pattern", *NAMES, "criterion"], lines)}
     starts = {k: patterns[k] for k in ("hue wheel", "random colours", "white")}
     curves = convergence(train, held_out, starts, 5 if args.quick else 60)
     plot(args.out, patterns, errors, curves)
@@ -184,17 +179,11 @@ def main() -> None:
     }  # fmt: skip
     if args.networks:
         trained = networks(args, {k: patterns[k] for k in ("white", "colour blocks", "default")})
-        text += "\n" + markdown(
+        tables["networks"] = table(
             ["network under", *NAMES, "average"],
             [[k, *(e[m] for m in (*NAMES, "average"))] for k, e in trained.items()],
         )
-        print(text)
         ratio = trained["default"]["average"] / trained["white"]["average"]
         bars.append(bar("network's map error, default over white", ratio, EARLIER, False))
         results["networks"] = trained
-    (args.out / "patterns.md").write_text(text)
-    write_results(args.out, {"bars": bars, **results})
-
-
-if __name__ == "__main__":
-    main()
+    write_results(args.out, {"bars": bars, **results}, tables)

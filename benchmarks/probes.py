@@ -1,6 +1,6 @@
 """Real photographs that are no captures: none may be taken for one.
 
-`python benchmarks/probes.py DIR --out OUT`. DIR holds `index.csv` with a column `file`, and for
+`--folder` holds `index.csv` with a column `file`, and for
 photographs of mirror balls `ball_cx, ball_cy, ball_rx, ball_ry` in pixels. Such balls are whole,
 held before a room without table or screen, so that there is nothing right to find; they are tried
 with the default rig, and with one in which a ball would look as large as theirs.
@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import bar, markdown, write_results
 
+from benchmarks.common.results import bar, benchmark_parser, table, write_results
 from invrender.capture.ball import find_ball
 from invrender.capture.lights import extract_lights
 from invrender.capture.orientation import find_upright_ball
@@ -62,23 +62,21 @@ def measure(photo: Photo, rig: Rig) -> dict[str, Any]:
     return row
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--out", type=Path, required=True)
-    args = parser.parse_args()
-    rows = []
+def parser() -> argparse.ArgumentParser:
+    p = benchmark_parser(__doc__, "the first three photographs")
+    p.add_argument("--folder", type=Path, required=True)
+    return p
+
+
+def main(args: argparse.Namespace) -> None:
+    rows: list[dict[str, Any]] = []
     with open(args.folder / "index.csv", newline="", encoding="utf-8") as file:
-        for entry in csv.DictReader(file):
+        for entry in [*csv.DictReader(file)][: 3 if args.quick else None]:
             for name, photo, rig in tries(args.folder, entry):
                 rows.append({"photo": entry["file"], "rig": name, **measure(photo, rig)})
                 print({k: round(v, 2) if isinstance(v, float) else v for k, v in rows[-1].items()})
     accepted = sum(r["accepted"] for r in rows)
-    write_results(args.out, {"bars": [bar("accepted", accepted, 0, False)], "photos": rows})
     header = ["photo", "rig", "confidence", "accepted"]
-    table = markdown(header, [[r.get(k, "refused") for k in header] for r in rows])
-    (args.out / "probes.md").write_text(table)
-
-
-if __name__ == "__main__":
-    main()
+    tried = table(header, [[r.get(k, "refused") for k in header] for r in rows])
+    results = {"bars": [bar("accepted", accepted, 0, False)], "photos": rows}
+    write_results(args.out, results, {"photos": tried})

@@ -1,25 +1,24 @@
 """Refinement on simulated captures: maps, re-rendering, uncertainty and time, before and after.
 
-    python benchmarks/refine.py [--quick] --out DIR [--materials DIR --envs DIR]
-
-Whole photographs are path-traced (`refine_captures`) and every capture is refined from its photo
-alone, with estimated lights; from the network's maps and, beside it, from a flat start. What the
-estimate costs is told by the network's start with the true lights. Captures are kept in
+Whole photographs are path-traced (`benchmarks.common.captures`) and every capture is refined from
+its photo alone, with estimated lights; from the network's maps and, beside it, from a flat start.
+What the estimate costs is told by the network's start with the true lights. Captures are kept in
 DIR/captures: a rerun only refines. Without folders, materials and rooms are procedural.
 """
 
 from __future__ import annotations
 
+import argparse
 import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import bar, markdown, write_results
-from matplotlib import pyplot as plt
-from refine_captures import arguments, make_captures, true_lights
 
+from benchmarks.common.captures import arguments, make_captures, true_lights
+from benchmarks.common.plot import plot_error_over_time
+from benchmarks.common.results import Table, bar, table, write_results
 from invrender.capture.crop import crop_mask, crop_sample
 from invrender.maps import NAMES, Maps, map_errors, resize_maps
 from invrender.pipeline import POOR_FIT, Seen, Stages, recover, see
@@ -121,15 +120,15 @@ def summarise(rows: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def lights_cost(results: dict[str, list[dict[str, Any]]]) -> str:
+def lights_cost(results: dict[str, list[dict[str, Any]]]) -> Table:
     """Average map RMSE with the lights found and with the true ones."""
-    table = []
+    lines = []
     for name, kinds in (("all", (False, True)), ("HDR", (False,)), ("JPEG", (True,))):
         some = [[r for r in results[i] if r["jpeg"] in kinds] for i in ("network", TRUE)]
         if some[0]:
             found, true = (pooled(rows, "average_refined") for rows in some)
-            table.append([name, found, true, found / true])
-    return markdown(["average map RMSE", "lights found", "true lights", "ratio"], table)
+            lines.append([name, found, true, found / true])
+    return table(["average map RMSE", "lights found", "true lights", "ratio"], lines)
 
 
 def bars(summary: dict[str, Any]) -> list[dict[str, Any]]:
@@ -149,25 +148,28 @@ def bars(summary: dict[str, Any]) -> list[dict[str, Any]]:
 
 def plot(results: dict[str, list[dict[str, Any]]], file: Path) -> None:
     """Map and re-render error against run time: a thin line a capture, a thick one for all."""
-    figure, axes = plt.subplots(1, 2, figsize=(10, 4))
-    for axis, name in zip(axes, ("average", "rerender"), strict=True):
-        for colour, (init, rows) in zip(("C0", "C1", "C2"), results.items(), strict=False):
-            for row in rows:
-                x = [row["seconds_initial"], row["seconds_refined"]]
-                axis.plot(x, [row[f"{name}_{w}"] for w in ("initial", "refined")], colour, lw=0.4)
+    panels: Any = {"average map": {}, "re-render": {}}
+    thin: Any = {title: {} for title in panels}
+    for title, name in zip(panels, ("average", "rerender"), strict=True):
+        for init, rows in results.items():
             s = summarise(rows)
             x = [s["seconds"]["seconds_initial"], s["seconds"]["seconds_refined"]]
-            axis.plot(x, s["errors"][name], colour, marker="o", lw=2.5, label=init)
-        axis.set(xscale="log", yscale="log", xlabel="seconds", ylabel=f"{name} RMSE")
-        axis.legend()
-    figure.tight_layout()
-    figure.savefig(file, dpi=110)
+            panels[title][init] = (x, s["errors"][name])
+            thin[title][init] = [
+                ([r["seconds_initial"], r["seconds_refined"]],
+                 [r[f"{name}_initial"], r[f"{name}_refined"]])
+                for r in rows
+            ]  # fmt: skip
+    plot_error_over_time(file, panels, thin, y="RMSE")
 
 
-def main() -> None:
-    parser = arguments(__doc__, "two small captures, under a minute", 24)
-    parser.add_argument("--init", choices=INITS, action="append", help="only this start")
-    args = parser.parse_args()
+def parser() -> argparse.ArgumentParser:
+    p = arguments(__doc__, "two small captures", 24)
+    p.add_argument("--init", choices=INITS, action="append", help="only this start")
+    return p
+
+
+def main(args: argparse.Namespace) -> None:
     count, size, width, spp = (2, 96, 720, 24) if args.quick else (args.count, 256, 960, 32)
     folders = make_captures(
         args.out / "captures", count, size, width, spp, args.materials, args.envs
@@ -189,26 +191,27 @@ def main() -> None:
             )
     summaries = {init: summarise(rows) for init, rows in results.items()}
     plot(results, args.out / "refine.png")
-    text = [lights_cost(results)] if {"network", TRUE} <= set(results) else []
-    for init, s in summaries.items():
-        table = [[n, *e, e[1] / e[0], s["coverage"].get(n, "")] for n, e in s["errors"].items()]
-        header = [f"RMSE, {init}", "initial", "refined", "ratio", "within one sigma"]
-        text += [markdown(header, table), markdown(["stage", "s"], list(s["stages"].items()))]
-    for init, rows in results.items():
-        names = (*NAMES, "average", "rerender")
-        table = [
-            [
-                r["capture"],
-                r["seconds_refined"],
-                *(f"{r[f'{n}_initial']:.4f} → {r[f'{n}_refined']:.4f}" for n in names),
-            ]
-            for r in rows
-        ]
-        text.append(markdown([f"capture, {init}", "seconds", *names], table))
-    (args.out / "refine.md").write_text("\n".join(text))
     reached = bars(summaries["network"]) if "network" in summaries else []
-    write_results(args.out, {"summaries": summaries, "rows": results, "bars": reached})
+    content = {"summaries": summaries, "rows": results, "bars": reached}
+    write_results(args.out, content, tables(results, summaries))
 
 
-if __name__ == "__main__":
-    main()
+def tables(results: dict[str, list[dict[str, Any]]], summaries: dict[str, Any]) -> dict[str, Table]:
+    """Errors and stages by start, and what it costs to estimate the lights."""
+    found = {}
+    for init, s in summaries.items():
+        found[f"from {init}"] = table(
+            ["RMSE", "initial", "refined", "ratio", "within one sigma"],
+            [[n, *e, e[1] / e[0], s["coverage"].get(n)] for n, e in s["errors"].items()],
+        )
+    stages = list(dict.fromkeys(n for s in summaries.values() for n in s["stages"]))
+    found["seconds"] = table(
+        ["stage, median seconds", *summaries],
+        [
+            *([n, *(s["stages"].get(n) for s in summaries.values())] for n in stages),
+            ["all", *(s["seconds"]["seconds_refined"] for s in summaries.values())],
+        ],
+    )
+    if {"network", TRUE} <= set(results):
+        found["lights"] = lights_cost(results)
+    return found

@@ -1,7 +1,5 @@
 """The refinement's optimisers against others: map error against run time, from the same start.
 
-    python benchmarks/refine_baselines.py [--quick] --captures DIR --out DIR
-
 All start at the network's maps, on the same photo and lights. Most minimise one objective,
 Σ (photo - I)²/R + (θ - θ₀)ᵀΣ⁻¹(θ - θ₀), with the network's prior, its deviations times the `SHARE`
 of the cautious step: per-pixel Gauss–Newton, Adam and L-BFGS with this package's estimator and
@@ -24,12 +22,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from common import bar, markdown, write_results
-from forward_gradients import sample_sensor
-from matplotlib import pyplot as plt
 from scipy.optimize import minimize
-from torch_forward import TorchScene
 
+from benchmarks.common.captures import arguments, make_captures
+from benchmarks.common.gradients import sample_sensor
+from benchmarks.common.plot import plot_error_over_time
+from benchmarks.common.results import Table, bar, table, write_results
+from benchmarks.common.torch_forward import TorchScene
 from invrender.maps import Maps, map_errors, resize_maps
 from invrender.pipeline import Seen, Stages, see
 from invrender.refine.cautious import SHARE, correct
@@ -319,57 +318,55 @@ def faster(curves: dict[str, Curve], method: str, baseline: str) -> float:
     return 0.0 if ours is None else theirs / max(ours, 1e-9)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--captures", type=Path, required=True, help="of benchmarks/refine.py")
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--quick", action="store_true", help="one capture at 16 × 16")
-    parser.add_argument("--count", type=int, default=4)
+def medians(results: dict[str, dict[str, Curve]]) -> Table:
+    """Each method's medians over the captures."""
+    rows = []
+    for method in next(iter(results.values())):
+        curves = [c[method] for c in results.values()]
+        best = [min(p[1] for p in c) for c in curves]
+        seconds = [reached(c, 1, SAME * b) or 0.0 for c, b in zip(curves, best, strict=True)]
+        errors = [b / c[0][1] for c, b in zip(curves, best, strict=True)]
+        costs = [min(p[2] for p in c) / c[0][2] for c in curves]
+        rows.append([method, *(float(np.median(v)) for v in (errors, seconds, costs))])
+    header = ["", "map error over the start's, best", "processor seconds to it"]
+    return table([*header, "cost over the start's, lowest"], rows)
+
+
+def parser() -> argparse.ArgumentParser:
+    parser = arguments(__doc__, "one capture at 16 × 16", 4)
+    parser.add_argument("--captures", type=Path, help="made by `refine` before, else by this")
     parser.add_argument("--size", type=int, default=64)
     parser.add_argument("--steps", type=int, default=32, help="at most, of the iterative methods")
     parser.add_argument("--seconds", type=float, default=10.0, help="at most, a method and rate")
-    args = parser.parse_args()
+    return parser
+
+
+def main(args: argparse.Namespace) -> None:
     if args.quick:
         args.count, args.size, args.steps, args.seconds = 1, 16, 4, 1.0
     torch.set_num_threads(1)
-    args.out.mkdir(parents=True, exist_ok=True)
+    width, spp = (720, 24) if args.quick else (960, 32)
+    made = args.captures or args.out / "captures"
+    folders = make_captures(made, args.count, 256, width, spp, args.materials, args.envs)
     results: dict[str, dict[str, Curve]] = {}
-    rows = []
-    for folder in sorted(p for p in args.captures.iterdir() if p.is_dir())[: args.count]:
+    for folder in folders:
         curves = results[folder.name] = measure(folder, args.size, args.seconds, args.steps)
         for name, curve in curves.items():
             best = min(p[1] for p in curve)
-            times = [reached(curve, 1, SAME * best), curve[-1][0]]
-            costs = [curve[0][2], min(p[2] for p in curve)]
-            rows.append([folder.name, name, curve[0][1], best, curve[-1][1], *times, *costs])
-            print(*rows[-1], flush=True)
+            print(f"{folder.name} {name}: {curve[0][1]:.4f} → {best:.4f}", flush=True)
     bars = []
     for baseline, least in (("Adam, Mitsuba prb", 30.0), ("Adam, PyTorch", 5.0)):
         for method in ("Gauss–Newton", "correction, cautious step"):
             ratio = float(np.median([faster(c, method, baseline) for c in results.values()]))
             name = f"{method}: times faster than {baseline} to its best map error, median"
             bars.append(bar(name, ratio, least, at_least=True))
-    figure, axes = plt.subplots(
-        2, len(results), figsize=(5 * len(results), 7), squeeze=False, sharex="col"
-    )
-    for column, (capture, curves) in zip(axes.T, results.items(), strict=True):
-        for name, curve in curves.items():
-            t, *values = np.array(curve).T
-            for axis, y in zip(column, values, strict=True):
-                axis.plot(np.maximum(t, 1e-2), y, marker=".", label=name)
-                axis.set(xscale="log", yscale="log")
-        column[0].set_title(capture)
-        column[1].set_xlabel("processor seconds")
-    axes[0, 0].set_ylabel("average map RMSE")
-    axes[1, 0].set_ylabel("cost a pixel")
-    axes[0, 0].legend(fontsize=8)
-    figure.tight_layout()
-    figure.savefig(args.out / "refine_baselines.png", dpi=110)
-    header = ["capture", "method", "map error at the start", "best", "at the end"]
-    header += ["processor seconds to the best", "in all", "cost a pixel at the start", "lowest"]
-    (args.out / "refine_baselines.md").write_text(markdown(header, rows))
-    write_results(args.out, {"curves": results, "bars": bars})
-
-
-if __name__ == "__main__":
-    main()
+    panels = {
+        f"{capture}, {what}": {m: ([p[0] for p in c], [p[k] for p in c]) for m, c in curves.items()}
+        for k, what in ((1, "average map RMSE"), (2, "cost a pixel"))
+        for capture, curves in results.items()
+    }
+    plot_error_over_time(
+        args.out / "refine_baselines.png", panels, x="processor seconds", y="",
+        columns=len(results),
+    )  # fmt: skip
+    write_results(args.out, {"curves": results, "bars": bars}, {"medians": medians(results)})

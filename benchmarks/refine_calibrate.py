@@ -1,8 +1,6 @@
 """By how much errors exceed what is expected of them, once lights are estimated and not known.
 
-    python benchmarks/refine_calibrate.py [--quick] --out DIR --materials DIR --envs DIR
-
-Refines captures like those of `refine.py`, but none of its materials and rooms, from the photo
+Refines captures like those of `refine`, but none of its materials and rooms, from the photo
 alone: real ones that the networks have seen, and half as many procedural ones that they have not.
 For each map, the factor on its sigma with which 68% of the truth lies within, of all pixels and
 captures of a kind together, and the mean over both kinds: what `invrender.refine.priors.UNTOLD` is
@@ -11,14 +9,15 @@ to be multiplied by, again until it is one.
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import markdown, write_results
 from numpy.typing import NDArray
-from refine_captures import arguments, make_captures
 
+from benchmarks.common.captures import arguments, make_captures
+from benchmarks.common.results import table, write_results
 from invrender.maps import NAMES, resize_maps
 from invrender.pipeline import Stages, recover, see
 from invrender.report.results import deviations
@@ -43,9 +42,11 @@ def ratios(folder: Path, size: int) -> dict[str, NDArray[np.floating[Any]]]:
     return out
 
 
-def main() -> None:
-    parser = arguments(__doc__, "three small captures, under a minute", 16)
-    args = parser.parse_args()
+def parser() -> argparse.ArgumentParser:
+    return arguments(__doc__, "three small captures", 16)
+
+
+def main(args: argparse.Namespace) -> None:
     count, size, width, spp = (2, 96, 480, 8) if args.quick else (args.count, 256, 960, 32)
     kinds = {
         "real": make_captures(
@@ -67,16 +68,10 @@ def main() -> None:
         factors[kind] = {n: float(np.quantile(r, SURE)) for n, r in every.items()}
         covered[kind] = {n: float((r <= 1).mean()) for n, r in every.items()}
     mean = {n: float(np.mean([f[n] for f in factors.values()])) for n in NAMES}
-    table = [
+    lines = [
         [n, *(c[n] for c in covered.values()), *(f[n] for f in factors.values()), mean[n]]
         for n in NAMES
     ]
     header = ["map", *(f"within one sigma, {k}" for k in kinds), *(f"factor, {k}" for k in kinds)]
-    text = markdown([*header, "mean"], table)
-    (args.out / "refine_calibrate.md").write_text(text)
-    print(text)
-    write_results(args.out, {"factors": factors, "mean": mean, "within": covered})
-
-
-if __name__ == "__main__":
-    main()
+    results = {"factors": factors, "mean": mean, "within": covered}
+    write_results(args.out, results, {"factors": table([*header, "mean"], lines)})

@@ -1,7 +1,5 @@
 """Stiff and extreme samples: how far refinement comes, and what it says of it.
 
-    python benchmarks/refine_extremes.py [--quick] --out DIR
-
 Photos are rendered by the forward model from known maps and refined from a flat start and from the
 networks' maps, with the true lights unless the case says otherwise. A run warns where the photo's
 large shades are not explained to within `invrender.pipeline.POOR_FIT`, or where the albedo's
@@ -15,13 +13,12 @@ import itertools
 import time
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import markdown, write_results
 from numpy.typing import NDArray
 
+from benchmarks.common.results import benchmark_parser, table, write_results
 from invrender.data.environments import procedural_environment
 from invrender.maps import Maps, constant_maps, map_errors
 from invrender.pattern.default import default_pattern
@@ -148,12 +145,11 @@ def run(case: Case, seed: int, init: str) -> dict[str, Any]:
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--quick", action="store_true", help="16 × 16 pixels")
-    args = parser.parse_args()
-    args.out.mkdir(parents=True, exist_ok=True)
+def parser() -> argparse.ArgumentParser:
+    return benchmark_parser(__doc__, "16 × 16 pixels")
+
+
+def main(args: argparse.Namespace) -> None:
     results: dict[str, Any] = {}
     rows = []
     numbered = enumerate(cases(16 if args.quick else 64).items())
@@ -169,9 +165,4 @@ def main() -> None:
     names = [*next(iter(results.values()))["initial"]]
     header = ["case", "start", *names, "photo error", "coarse", "light in albedo", "steps"]
     header += ["converged", "seconds"]
-    (args.out / "refine_extremes.md").write_text(markdown(header, rows))
-    write_results(args.out, {"cases": results})
-
-
-if __name__ == "__main__":
-    main()
+    write_results(args.out, {"cases": results}, {"cases": table(header, rows)})

@@ -1,25 +1,24 @@
 """How the maps suffer where display and rig are not as told: colours and curve, screen, camera.
 
-    python benchmarks/refine_robust.py [--quick] --out DIR [--materials DIR --envs DIR]
-
-The same samples in the same rooms are photographed (path-traced, as in `refine_captures`) four
-times: with pattern and rig as told; with each channel of the pattern times 0.8 to 1.25 and an
-exponent of 1/2.2 to 2.2 on it; with the screen shifted by up to a tenth of the sample's size and
-tilted by up to 10 degrees; and with the camera held 2 mm and 1.2 degrees off (standard deviations).
-Everything is drawn anew for each capture; the refinement is told the nominal pattern and rig.
-Captures are kept in DIR/captures: a rerun only refines.
+The same samples in the same rooms are photographed four times (path-traced, as in
+`benchmarks.common.captures`): with pattern and rig as told; with each channel of the pattern times
+0.8 to 1.25 and an exponent of 1/2.2 to 2.2 on it; with the screen shifted by up to a tenth of the
+sample's size and tilted by up to 10 degrees; and with the camera held 2 mm and 1.2 degrees off
+(standard deviations). Everything is drawn anew for each capture; the refinement is told the nominal
+pattern and rig. Captures are kept in DIR/captures: a rerun only refines.
 """
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import bar, markdown, write_results
-from refine import measure, pooled
-from refine_captures import arguments, make_capture, sample_and_room
 
+from benchmarks.common.captures import arguments, make_capture, sample_and_room
+from benchmarks.common.results import bar, table, write_results
+from benchmarks.refine import measure, pooled
 from invrender.maps import NAMES
 from invrender.pattern.default import default_pattern
 from invrender.rig import Rig
@@ -56,9 +55,11 @@ def make_captures(
     return folders
 
 
-def main() -> None:
-    parser = arguments(__doc__, "one small sample, under a minute", 8)
-    args = parser.parse_args()
+def parser() -> argparse.ArgumentParser:
+    return arguments(__doc__, "one small sample", 8)
+
+
+def main(args: argparse.Namespace) -> None:
     count, size, width, spp = (1, 96, 640, 16) if args.quick else (args.count, 256, 960, 32)
     rows: dict[str, list[dict[str, Any]]] = {}
     for k in range(count):
@@ -72,20 +73,15 @@ def main() -> None:
     names = (*NAMES, "average", "rerender")
     errors = {c: {n: pooled(r, f"{n}_refined") for n in names} for c, r in rows.items()}
     clean = errors["clean"]["average"]
-    table = [[c, *e.values(), e["average"] / clean] for c, e in errors.items()]
-    text = [markdown(["RMSE, refined", *names, "average over clean"], table)]
-    table = [
+    lines = [[c, *e.values(), e["average"] / clean] for c, e in errors.items()]
+    tables = {"errors": table(["RMSE, refined", *names, "average over clean"], lines)}
+    lines = [
         [r["clean"]["capture"][:3], *(r[c]["average_refined"] for c in errors)]
         for r in (dict(zip(rows, pair, strict=True)) for pair in zip(*rows.values(), strict=True))
     ]
-    text.append(markdown(["sample, average RMSE", *errors], table))
-    (args.out / "refine_robust.md").write_text("\n".join(text))
+    tables["samples"] = table(["sample, average RMSE", *errors], lines)
     bars = [
         bar(f"average map RMSE, {c} over clean", errors[c]["average"] / clean, most, at_least=False)
         for c, most in ALLOWED.items()
     ]
-    write_results(args.out, {"rows": rows, "errors": errors, "bars": bars})
-
-
-if __name__ == "__main__":
-    main()
+    write_results(args.out, {"rows": rows, "errors": errors, "bars": bars}, tables)

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from benchmarks.common.results import benchmark_parser
 from invrender.capture.lights import Lights
 from invrender.colour import linear_to_srgb
 from invrender.data.environments import find_environments, procedural_environment, read_environment
@@ -34,7 +35,7 @@ from invrender.rig import Rig
 from invrender.sphere import rotate_environment, scale_environment
 
 Array = NDArray[np.floating[Any]]
-HOLDOUT = Path(__file__).parents[1] / "nets" / "training" / "holdout.txt"
+HOLDOUT = Path(__file__).parents[2] / "nets" / "training" / "holdout.txt"
 FIRST_SEED = 90_000  # of procedural materials and rooms that nothing else uses
 GAIN = 2.0  # radiance of the screen's white
 SHIFT, TILT = 3e-3, 3.0  # standard deviations, metres and degrees, of the screen's pose
@@ -83,9 +84,7 @@ def make_captures(
 
 def arguments(doc: str | None, quick: str, count: int) -> argparse.ArgumentParser:
     """The command line of a benchmark on such captures, ``count`` of them unless it says so."""
-    parser = argparse.ArgumentParser(description=doc.splitlines()[0] if doc else None)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--quick", action="store_true", help=quick)
+    parser = benchmark_parser(doc, quick)
     parser.add_argument("--materials", type=Path, help="folder of materials; the held-out are used")
     parser.add_argument("--envs", type=Path, help="folder of environments; the held-out are used")
     parser.add_argument("--count", type=int, default=count)

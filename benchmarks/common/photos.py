@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
 
+from benchmarks.common.results import benchmark_parser
 from invrender.capture.table import room_irradiance
 from invrender.colour import linear_to_srgb, srgb_to_linear
 from invrender.data.environments import find_environments, procedural_environment, read_environment
@@ -59,9 +60,7 @@ class Shot:
 
 def arguments(doc: str | None, count: int, what: str) -> argparse.ArgumentParser:
     """The command line of a benchmark on such photographs, ``count`` of them unless it says so."""
-    parser = argparse.ArgumentParser(description=doc)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--quick", action="store_true", help="within a minute")
+    parser = benchmark_parser(doc, "a few photos")
     parser.add_argument("--count", type=int, default=count, help=f"{what} ({count})")
     parser.add_argument("--rooms", type=Path, help="folder of equirectangular files, for half")
     return parser

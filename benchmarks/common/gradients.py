@@ -8,8 +8,8 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from scenes import MAPS, RIG, Array, Case, averaged, curve
 
+from benchmarks.common.scenes import MAPS, RIG, Array, Case, averaged, curve
 from invrender.render import path_traced as photograph
 from invrender.render import renderer as render
 from invrender.render.backend import Float, dr, vector

@@ -6,10 +6,10 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from common import timed
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from benchmarks.common.timing import timed
 from invrender.data.environments import procedural_environment
 from invrender.maps import Maps
 from invrender.render import path_traced as photograph

@@ -1,0 +1,1 @@
+"""What the benchmarks share: the machine, results and tables, timings, plots, captures, scenes."""
