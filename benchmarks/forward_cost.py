@@ -32,8 +32,9 @@ from benchmarks.common.scenes import (
     make_maps,
 )
 from invrender.maps import Maps
-from invrender.render import renderer as render
+from invrender.render import Fast, Material
 from invrender.render.backend import Float, UInt, dr
+from invrender.render.renderer import tile_of
 from invrender.render.scene import make_scene, make_view
 
 LIMIT = 4.0  # GB that a 4096² render may take
@@ -62,12 +63,13 @@ def specialisation(n: int, samples: int, rounds: int) -> list[list[Any]]:
     runs = []
     for maps, p, e in cases.values():
         scene = make_scene(RIG, p, e, GAIN)
-        args = (render.prepare(scene), make_view(scene, n, n), render.material_from_maps(maps))
-        for f in (render.radiance, render.pixel_jacobian):
+        renderer = Fast(scene)
+        args = (make_view(scene, n, n), tile_of(maps, 0, n * n))
+        for f in (renderer.radiance, renderer.pixel_jacobian):
 
             def run(f: Any = f, args: Any = (*args, samples)) -> None:
                 out = f(*args)
-                dr.eval(out if f is render.radiance else list(out.__dict__.values()))
+                dr.eval(out if f.__name__ == "radiance" else list(out.__dict__.values()))
                 dr.sync_thread()
 
             runs.append(run)
@@ -149,14 +151,14 @@ def work(n: int, samples: int, rounds: int) -> dict[str, float]:
     """
     pattern, environment = Case("glossy", 8).pattern, np.full((64, 128, 3), 0.3, np.float32)
     scene = make_scene(RIG, pattern, environment, GAIN)
-    prepared, view = render.prepare(scene), make_view(scene, n, n)
+    renderer, view = Fast(scene), make_view(scene, n, n)
     materials = {
-        name: render.material_from_maps(make_maps(n, rho, rho + 1e-4, 0.0, 0.15))
+        name: Material.from_maps(make_maps(n, rho, rho + 1e-4, 0.0, 0.15))
         for name, rho in (("narrow", 0.02), ("wide", 0.7))
     }
 
     def run(name: str, count: int) -> None:
-        dr.eval(render.radiance(prepared, view, materials[name], count))
+        dr.eval(renderer.radiance(view, materials[name], count))
 
     run("wide", 1)
     kernel = largest_kernel(lambda: run("wide", samples))
@@ -219,7 +221,7 @@ def render_once(n: int, samples: int) -> None:
     maps = Maps(*(grow(getattr(small, k)) for k in ("diffuse", "specular", "roughness", "normal")))
     pattern = np.random.default_rng(0).uniform(size=(64, 64, 3))
     before, start = usage(), time.perf_counter()
-    image = render.render(RIG, maps, pattern, make_environment("sun"), GAIN, samples=samples)
+    image = Fast(make_scene(RIG, pattern, make_environment("sun"), GAIN)).render(maps, samples)
     assert np.all(np.isfinite(image))
     print(before, usage(), time.perf_counter() - start)
 
@@ -239,7 +241,7 @@ def bias(name: str, n: int, counts: list[int], quick: bool) -> dict[str, Any]:
         return float(np.sqrt(max(np.mean((image - reference) ** 2) - noise2, 0)) / reference.mean())
 
     errors = [error(case.ours("fast", k, 1)) for k in counts]
-    case.prepared["fast"] = render.prepare(case.scene, "fast", 2)
+    case.renderers["fast"] = Fast(case.scene, 2)
     return {
         "samples": counts,
         "errors": errors,

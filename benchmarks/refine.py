@@ -24,7 +24,6 @@ from invrender.maps import NAMES, Maps, map_errors, resize_maps
 from invrender.pipeline import POOR_FIT, Seen, Stages, recover, see
 from invrender.refine.checks import coarse_error
 from invrender.render.point_lights import rerender
-from invrender.render.renderer import picture
 from invrender.report.results import deviations
 
 TRUE = "network, true lights"
@@ -78,9 +77,7 @@ def measure(folder: Path, size: int, init: str) -> dict[str, Any]:
         "coverage": shares,
         "covered": float(np.mean(list(shares.values()))),
         "converged": result.converged,
-        "coarse": coarse_error(
-            picture(shots[0].prepared, result.maps, 64), seen.photo, seen.clipped
-        ),
+        "coarse": coarse_error(shots[0].renderer.render(result.maps, 64), seen.photo, seen.clipped),
     }
     row["warned"] = row["coarse"] > POOR_FIT[init]
     for when, maps in (("initial", start), ("refined", result.maps)):

@@ -60,7 +60,7 @@ class Problem:
         self.n, self.photo = n, self.seen.photo
         self.truth: Maps = resize_maps(self.seen.capture.truth, n, n)
         clipped = self.seen.clipped if self.seen.clipped.any() else None
-        self.shot = Shot(self.photo, self.seen.prepare(), clipped)
+        self.shot = Shot(self.photo, self.seen.renderer(), clipped)
         lights = self.seen.lights
         self.network = Reconstructor()
         self.estimate = self.network(
@@ -96,7 +96,7 @@ def ours(problem: Problem) -> Gradient:
     """Value and gradient by the fast estimator's Jacobian."""
 
     def run(z: Array, seed: int) -> tuple[float, Array]:
-        image, jacobian = linearise(problem.shot.prepared, problem.theta(z), 64)
+        image, jacobian = linearise(problem.shot.renderer, problem.theta(z), 64)
         residual = problem.photo - image
         weighted = residual / problem.noise
         gradient = -2 * np.einsum("hwcp,hwc->hwp", jacobian, weighted)
@@ -241,7 +241,7 @@ def chain(problem: Problem) -> Curve:
     curve = [point(problem, np.zeros_like(problem.prior.mean), 0.0)]
     for _ in range(2):  # the first compiles
         began = time.process_time()
-        e = improve(problem.photo, problem.shot.prepared, problem.estimate, problem.seen.clipped)
+        e = improve(problem.photo, problem.shot.renderer, problem.estimate, problem.seen.clipped)
         prior = network_prior(e.maps, e.sigma)
         times = [time.process_time() - began]
         result = correct([problem.shot], prior)
@@ -268,7 +268,7 @@ def adapt(problem: Problem, rate: float, seconds: float, limit: int) -> tuple[fl
         parts = [out["diffuse"], out["specular"], out["roughness"], slopes]
         theta = torch.cat(parts, 1)[0].permute(1, 2, 0)
         value = theta.detach().numpy()
-        image, jacobian = linearise(problem.shot.prepared, project(value.copy()), 64)
+        image, jacobian = linearise(problem.shot.renderer, project(value.copy()), 64)
         residual = problem.photo - image
         least = min(least, float((residual**2 / problem.noise).sum()))
         last = i == limit or spent > seconds

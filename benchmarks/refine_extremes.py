@@ -30,7 +30,7 @@ from invrender.refine.gauss_newton import Shot, refine
 from invrender.refine.lobes import fit_lobes
 from invrender.refine.priors import lobe_prior, network_prior
 from invrender.refine.theta import project, to_theta
-from invrender.render.renderer import picture, prepare
+from invrender.render import Fast
 from invrender.render.scene import make_scene
 from invrender.rig import Rig
 from invrender.sphere import scale_environment
@@ -89,8 +89,8 @@ def cases(n: int) -> dict[str, Case]:
 def photograph(case: Case, seed: int) -> tuple[Array, NDArray[np.bool_] | None]:
     """The case's photo (n, n, 3), and where it is saturated."""
     rng = np.random.default_rng(seed)
-    true = prepare(make_scene(case.rig, PATTERN, case.environment, GAIN))
-    photo = picture(true, case.maps, 256)
+    true = Fast(make_scene(case.rig, PATTERN, case.environment, GAIN))
+    photo = true.render(case.maps, 256)
     photo = np.maximum(photo * (1 + case.noise * rng.standard_normal(photo.shape)), 0)
     photo = photo.astype(np.float32)
     if not case.clip:
@@ -108,25 +108,25 @@ def run(case: Case, seed: int, init: str) -> dict[str, Any]:
     """Photograph a case and refine it."""
     photo, clipped = photograph(case, seed)
     began = time.perf_counter()
-    prepared = prepare(make_scene(RIG, PATTERN, case.environment, GAIN))
-    shot = Shot(photo, prepared, clipped)
+    renderer = Fast(make_scene(RIG, PATTERN, case.environment, GAIN))
+    shot = Shot(photo, renderer, clipped)
     if init == "flat":
-        start = flat_maps(photo, prepared)
-        prior = lobe_prior(fit_lobes(photo, prepared))
+        start = flat_maps(photo, renderer)
+        prior = lobe_prior(fit_lobes(photo, renderer))
         result = refine([shot], prior)
     else:
         reconstruct, improve = networks()
         estimate = reconstruct(photo, RIG, PATTERN, GAIN, case.environment)
         start = estimate.maps
-        estimate = improve(photo, prepared, estimate, clipped)
+        estimate = improve(photo, renderer, estimate, clipped)
         prior = network_prior(estimate.maps, estimate.sigma)
         result = correct([shot], prior)
     seconds = time.perf_counter() - began
     images = [*result.maps.encoded().values(), result.sigma]
     before, after = map_errors(start, case.maps), map_errors(result.maps, case.maps)
-    baked = baked_light(result.maps.diffuse, prepared)
+    baked = baked_light(result.maps.diffuse, renderer)
     mask = np.zeros(photo.shape[:2], bool) if clipped is None else clipped
-    shown = picture(prepared, result.maps, 256)
+    shown = renderer.render(result.maps, 256)
     coarse = coarse_error(shown, photo, mask)
     moved = np.abs(to_theta(result.maps) - project(prior.mean.copy())).max(-1)
     return {

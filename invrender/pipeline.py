@@ -52,19 +52,17 @@ class Seen:
     clipped: NDArray[np.bool_]
     turned: Sequence[str] = ()
 
-    def prepare(self, turn: int = 0) -> Any:
+    def renderer(self, turn: int = 0) -> Any:
         """The forward model of these lights, turned by quarters about the sample's normal."""
         from invrender.refine.several import turned_environment, turned_rig
-        from invrender.render.renderer import prepare
+        from invrender.render.fast.estimator import Fast
         from invrender.render.scene import make_scene
 
         rig, room = self.lights.rig, self.lights.environment
         if turn % 4:
             rig, room = turned_rig(rig, turn), turned_environment(room, turn)
         dark = not room.any()
-        return prepare(
-            make_scene(rig, self.lights.pattern, None if dark else room, self.lights.gain)
-        )
+        return Fast(make_scene(rig, self.lights.pattern, None if dark else room, self.lights.gain))
 
 
 class Stages:
@@ -158,12 +156,12 @@ def recover(
         from invrender.refine.several import find_turn
         from invrender.refine.theta import to_maps
 
-        shots = [Shot(s.photo, s.prepare(), s.clipped if s.clipped.any() else None) for s in seen]
+        shots = [Shot(s.photo, s.renderer(), s.clipped if s.clipped.any() else None) for s in seen]
     if networks is None:
         with stage("initial maps"):
-            starts = [flat_maps(s.photo, s.prepared, samples) for s in shots]
+            starts = [flat_maps(s.photo, s.renderer, samples) for s in shots]
         with stage("materials"):
-            own = [fit_lobes(s.photo, s.prepared, samples) for s in shots]
+            own = [fit_lobes(s.photo, s.renderer, samples) for s in shots]
         turns = [0] + [find_turn(m, starts[0]) for m in starts[1:]]
         prior = lobe_prior(own[0])
     else:
@@ -185,7 +183,7 @@ def recover(
         with stage("refine"):
             for i, s in enumerate(shots):
                 estimates[i] = improve(
-                    s.photo, s.prepared, estimates[i], s.clipped, samples, told("refine")
+                    s.photo, s.renderer, estimates[i], s.clipped, samples, told("refine")
                 )
                 if estimates[i].interrupted:
                     break
@@ -219,7 +217,7 @@ def _turned(seen: Seen, quarters: int) -> Any:
 
     clipped = np.rot90(seen.clipped, -quarters) if seen.clipped.any() else None
     photo = np.ascontiguousarray(np.rot90(seen.photo, -quarters))
-    return Shot(photo, seen.prepare(-quarters), clipped)
+    return Shot(photo, seen.renderer(-quarters), clipped)
 
 
 def refine_capture(
@@ -256,11 +254,10 @@ def refine_capture(
     first = seen[0]
     with stage("render"):
         from invrender.refine.checks import baked_light
-        from invrender.render.renderer import picture
 
-        lights = shots[0].prepared
+        lights = shots[0].renderer
         baked = baked_light(result.maps.diffuse, lights, samples)
-        pictures = [picture(lights, maps, FINAL_SAMPLES) for maps in (start, result.maps)]
+        pictures = [lights.render(maps, FINAL_SAMPLES) for maps in (start, result.maps)]
     before, after = (photo_error(p, first.photo, first.clipped) for p in pictures)
     coarse = coarse_error(pictures[1], first.photo, first.clipped)
     errors = None

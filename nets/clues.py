@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from invrender.render.backend import Float, dr, vector
-from invrender.render.renderer import prepare, shade
+from invrender.render.fast.estimator import Fast
 from invrender.render.scene import Scene, make_scene, make_view
 from invrender.rig import Rig
 from invrender.sphere import resample_environment
@@ -35,11 +35,11 @@ def plane_clues(scene: Scene, size: int = CLUE_SIZE, samples: int = SAMPLES) -> 
     """Radiance (size, size, 12) of the four materials of `BASIS`, flat, over the sample; and that
     of the `SLOPED` ones' derivatives along the slopes p and q of n ∝ (p, q, 1), (size, size, 18).
     """
-    prepared = prepare(scene)
+    renderer = Fast(scene)
     vec3 = vector(scene.scalar, 3)
     view = make_view(scene, size, size)
     up = vec3(*(dr.opaque(scene.scalar, c) for c in (0.0, 0.0, 1.0)))
-    shadings = [shade(prepared, view, dr.opaque(Float, r), up, samples, True) for r in ROUGHNESS]
+    shadings = [renderer.shade(view, dr.opaque(Float, r), up, samples, True) for r in ROUGHNESS]
     # Radiance, then along p and q: the tangents of the plane's own frame are x and y.
     parts = [[(s.irradiance, s.b, s.a), s.tangents[1], s.tangents[2]] for s in shadings]
     dr.eval(parts)  # one launch for all

@@ -20,8 +20,8 @@ from invrender.maps import NAMES, Maps, resize_maps, unit_normals
 from invrender.refine.gauss_newton import linearise
 from invrender.refine.lobes import Lobes, fit_lobes, read_lobes
 from invrender.refine.theta import to_theta
-from invrender.render.fast.tables import Tables
-from invrender.render.renderer import Unbiased, prepare
+from invrender.render.fast.estimator import Fast
+from invrender.render.renderer import Renderer
 from invrender.render.scene import make_scene
 from invrender.rig import Rig
 from invrender.sampling import resize
@@ -92,14 +92,14 @@ class Reconstructor:
         unit = white_level(lights)
         scale = 1 / max(unit, 1e-20)
         scene = make_scene(rig, pattern, environment, np.asarray(gain) * scale, scale)
-        prepared = prepare(scene)
+        renderer = Fast(scene)
         report(0.3)
 
         def maps_of(photo: Array, progress: Callable[[float], None] | None = None) -> Estimate:
             lobes = None
             if self.network.config.lobes:
                 seen = np.clip(np.nan_to_num(photo * scale, posinf=0.0, neginf=0.0), 0, 1e3)
-                lobes = read_lobes(seen, prepared)
+                lobes = read_lobes(seen, renderer)
             kept = keep and _kept(keep, self.notes, photo, *lights.values())
             out = predict(self.network, batch_of(photo, lights, lobes), progress, kept)
             return replace(estimate_of(out, unit), lobes=lobes)
@@ -119,7 +119,7 @@ class Corrector:
     def __call__(
         self,
         photo: Array,
-        prepared: Tables | Unbiased,
+        renderer: Renderer,
         estimate: Estimate,
         clipped: NDArray[np.bool_] | None = None,
         samples: int = 64,
@@ -134,16 +134,16 @@ class Corrector:
         `WHOLE` only the large shades are corrected."""
         if max(photo.shape[:2]) > WHOLE:
             small, start, few = _shrunk(WHOLE, photo, estimate, clipped)
-            return _joined(estimate, self(small, prepared, start, few, samples, progress))
+            return _joined(estimate, self(small, renderer, start, few, samples, progress))
         try:
             known = estimate.lobes
-            lobes = known.maps if known else fit_lobes(photo, prepared, samples)
+            lobes = known.maps if known else fit_lobes(photo, renderer, samples)
             for i in range(PASSES):
-                found = self._step(photo, prepared, estimate, lobes, clipped, samples)
+                found = self._step(photo, renderer, estimate, lobes, clipped, samples)
                 if max(photo.shape[:2]) > COARSE:
                     small, start, few = _shrunk(COARSE, photo, estimate, clipped)
                     own = resize_maps(lobes, *small.shape[:2])
-                    coarse = self._step(small, prepared, start, own, few, samples)
+                    coarse = self._step(small, renderer, start, own, few, samples)
                     found = _shaded(found, coarse, ["roughness"])
                 change = np.abs(found.maps.roughness - estimate.maps.roughness).mean()
                 estimate = found
@@ -155,11 +155,11 @@ class Corrector:
         return estimate
 
     def _step(
-        self, photo: Array, prepared: Tables | Unbiased, estimate: Estimate, lobes: Maps,
+        self, photo: Array, renderer: Renderer, estimate: Estimate, lobes: Maps,
         clipped: NDArray[np.bool_] | None, samples: int,
     ) -> Estimate:  # fmt: skip
         """One pass."""
-        inputs = linearised(photo, prepared, estimate, lobes, clipped, samples)
+        inputs = linearised(photo, renderer, estimate, lobes, clipped, samples)
         batch = {k: torch.from_numpy(v)[None] for k, v in inputs.items()}
         return estimate_of(predict(self.network, batch), estimate.unit)
 
@@ -220,7 +220,7 @@ def _kept(folder: Path, notes: dict[str, Any], photo: Array, *seen: NDArray[Any]
 
 def linearised(
     photo: Array,
-    prepared: Tables | Unbiased,
+    renderer: Renderer,
     estimate: Estimate,
     lobes: Maps,
     clipped: NDArray[np.bool_] | None,
@@ -229,7 +229,7 @@ def linearised(
     """The correction's inputs (`nets.correction`), float32, without a batch axis."""
     height, width = photo.shape[:2]
     theta = to_theta(estimate.maps)
-    image, jacobian = linearise(prepared, theta, samples)
+    image, jacobian = linearise(renderer, theta, samples)
     diagonal = [jacobian[..., range(3), range(k, k + 3)] for k in (0, 3)]
     columns = [jacobian[..., k] for k in (6, 7, 8)]
     unit = max(estimate.unit, 1e-20)

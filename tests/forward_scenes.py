@@ -9,10 +9,13 @@ from scipy.ndimage import gaussian_filter
 
 from invrender.maps import Maps
 from invrender.render.backend import ad, dr, vector
+from invrender.render.fast.estimator import Fast
+from invrender.render.mis import Mis
 from invrender.render.renderer import Material
-from invrender.render.scene import View, hash_bits
+from invrender.render.scene import View, hash_bits, make_scene
 
 Float64 = ad.Float64
+ESTIMATORS = {"fast": Fast, "mis": Mis}
 
 #            roughness   metal  tilt of normals
 MATERIALS = {
@@ -109,3 +112,12 @@ def configuration_view(scene: Any, c: dict[str, Any], seed: int = 1) -> tuple[Vi
         vec3(c["diffuse"]), vec3(c["specular"]), scalar(c["roughness"]), vec3(c["normal"])
     )
     return view, material
+
+
+def rendered(
+    rig: Any, maps: Maps, pattern: Any, environment: Any, gain: Any = 1.0, *,
+    estimator: str = "fast", samples: int = 64, seed: int = 0,
+) -> Any:  # fmt: skip
+    """Image (H, W, 3) of maps in a rig under these lights."""
+    renderer = ESTIMATORS[estimator](make_scene(rig, pattern, environment, gain))
+    return renderer.render(maps, samples, seed)

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.common.scenes import MAPS, RIG, Array, Case, averaged, curve
+from invrender.render import Material
 from invrender.render import path_traced as photograph
-from invrender.render import renderer as render
 from invrender.render.backend import Float, dr, vector
 from invrender.render.path_traced import mi
 from invrender.render.scene import make_view
@@ -125,16 +125,16 @@ def forward_backward(case: Case, samples: int, repeats: int) -> dict[str, float]
     for estimator in ("fast", "mis"):
 
         def forward(e: str = estimator) -> None:
-            dr.eval(render.radiance(case.prepared[e], view, case.material, samples))
+            dr.eval(case.renderers[e].radiance(view, case.material, samples))
             dr.sync_thread()
 
         def both(e: str = estimator) -> None:
-            m = render.Material(*(
+            m = Material(*(
                 type(v)(v) for v in (case.material.diffuse, case.material.specular,
                                      case.material.roughness, case.material.normal)))  # fmt: skip
             leaves = [m.diffuse, m.specular, m.roughness, m.normal]
             dr.enable_grad(leaves)
-            color = render.radiance(case.prepared[e], view, m, samples)
+            color = case.renderers[e].radiance(view, m, samples)
             dr.backward(dr.sum(dr.squared_norm(color - 0.5)))
             dr.eval([dr.grad(v) for v in leaves])
             dr.sync_thread()

@@ -27,7 +27,7 @@ from invrender.data.materials import procedural_material
 from invrender.files.images import Photo
 from invrender.maps import Maps, resize_maps
 from invrender.pattern.default import default_pattern
-from invrender.render.renderer import render
+from invrender.render import Fast, make_scene
 from invrender.rig import Rig
 from invrender.sphere import resample_environment, rotate_environment, scale_environment
 
@@ -312,7 +312,7 @@ def make_shot(
         a, c = rng.uniform(0, 2 * np.pi), rng.uniform(-0.03, 0.1)
         wide *= np.where(x * np.cos(a) + y * np.sin(a) > c, 0.45, 1)[..., None]
     maps = resize_maps(procedural_material(70_000 + seed, 256, 256), 256, 256)
-    sample = render(rig, maps, shown, environment, gain, samples=32)
+    sample = Fast(make_scene(rig, shown, environment, gain)).render(maps, 32)
     centre = None
     if ball:
         shift = np.clip(rng.normal(0, 2e-3, 2), -5e-3, 5e-3) if camera else np.zeros(2)

@@ -12,10 +12,9 @@ from scipy.ndimage import gaussian_filter
 from benchmarks.common.timing import timed
 from invrender.data.environments import procedural_environment
 from invrender.maps import Maps
+from invrender.render import Fast, Material, Mis, Renderer
 from invrender.render import path_traced as photograph
-from invrender.render import renderer as render
 from invrender.render.backend import dr
-from invrender.render.fast.tables import Tables
 from invrender.render.scene import make_scene, make_view
 from invrender.rig import Rig
 
@@ -78,8 +77,8 @@ class Case:
         blocks = np.random.default_rng(1).uniform(0, 1, (4, 4, 3))
         self.pattern = np.kron(blocks, np.ones((16, 16, 1))).astype(np.float32)
         self.scene = make_scene(RIG, self.pattern, self.environment, GAIN)
-        self.material = render.material_from_maps(self.maps)
-        self.prepared = {e: self.prepare(e) for e in ("fast", "mis")}
+        self.material = Material.from_maps(self.maps)
+        self.renderers = {e: self.prepare(e) for e in ("fast", "mis")}
         self.mitsuba = {
             kind: photograph.sample_scene(
                 RIG, self.maps, self.pattern, self.environment, GAIN, integrator=kind
@@ -87,18 +86,19 @@ class Case:
             for kind in ("path", "direct")
         }
 
-    def prepare(self, estimator: str) -> Any:
-        prepared: Any = render.prepare(self.scene, estimator)
-        if isinstance(prepared, Tables):
-            tables = (prepared.sky, prepared.screen)
-            grids = (prepared.sky_irradiance, prepared.vector_irradiance)
-            dr.eval([p.texels for p in tables if p], [g.values for g in grids if g])
-            dr.sync_thread()
-        return prepared
+    def prepare(self, estimator: str) -> Renderer:
+        if estimator == "mis":
+            return Mis(self.scene)
+        renderer = Fast(self.scene)
+        t = renderer.tables
+        tables, grids = (t.sky, t.screen), (t.sky_irradiance, t.vector_irradiance)
+        dr.eval([p.texels for p in tables if p], [g.values for g in grids if g])
+        dr.sync_thread()
+        return renderer
 
     def ours(self, estimator: str, samples: int, seed: int) -> Array:
         view = make_view(self.scene, self.n, self.n, seed)
-        color = render.radiance(self.prepared[estimator], view, self.material, samples)
+        color = self.renderers[estimator].radiance(view, self.material, samples)
         return np.asarray(color).T.reshape(self.n, self.n, 3)
 
     def mitsubas(self, kind: str, spp: int, seed: int) -> Array:
@@ -107,7 +107,7 @@ class Case:
     def jacobian(self, estimator: str, samples: int, seed: int, adjoint: Any) -> list[Array]:
         """Gradients of Σ adjoint·I with respect to the four maps."""
         view = make_view(self.scene, self.n, self.n, seed)
-        j = render.pixel_jacobian(self.prepared[estimator], view, self.material, samples)
+        j = self.renderers[estimator].pixel_jacobian(view, self.material, samples)
         normal = j.s * dr.dot(adjoint, j.tangent_s) + j.t * dr.dot(adjoint, j.tangent_t)
         roughness = dr.dot(adjoint, j.roughness)
         out = (adjoint * j.diffuse, adjoint * j.specular, roughness, normal)

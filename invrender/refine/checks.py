@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from invrender.refine.flat import USUAL_ROUGHNESS, plane_terms
-from invrender.render.fast.tables import Tables
-from invrender.render.renderer import Unbiased
+from invrender.render.renderer import Renderer
 from invrender.types import Array
 
 BLOCKS = 16  # a side, whose means the coarse error compares
@@ -41,7 +40,7 @@ PLAIN = 0.005  # deviation of the light's log ratio that is no sign
 SLIGHT = 0.05  # share of the light's log ratio that is no sign
 
 
-def baked_light(diffuse: Array, prepared: Tables | Unbiased, samples: int = 64) -> float:
+def baked_light(diffuse: Array, renderer: Renderer, samples: int = 64) -> float:
     """How much a diffuse albedo (H, W, 3) has of the light's colours the other way round, 0 to 1.
 
     Per-pixel albedos explain any photo of a matt sample, under any light. Where the light is wrong
@@ -56,7 +55,7 @@ def baked_light(diffuse: Array, prepared: Tables | Unbiased, samples: int = 64) 
         ((np.arange(n) + 0.5) / n * of).astype(np.intp)
         for n, of in zip((h, w), diffuse.shape[:2], strict=True)
     )
-    light = plane_terms(prepared, h, w, USUAL_ROUGHNESS, samples)[0]
+    light = plane_terms(renderer, h, w, USUAL_ROUGHNESS, samples)[0]
     albedo = diffuse[np.ix_(rows, columns)]
     greatest = 0.0
     for c in (0, 2):

@@ -6,18 +6,17 @@ import numpy as np
 
 from invrender.maps import Maps, constant_maps
 from invrender.render.backend import dr, vector
-from invrender.render.fast.tables import Tables
-from invrender.render.renderer import Unbiased, shade
+from invrender.render.renderer import Renderer
 from invrender.render.scene import make_view
 from invrender.types import Array
 
 USUAL_ROUGHNESS, USUAL_SPECULAR = 0.55, 0.04  # medians of common materials
 
 
-def flat_maps(photo: Array, prepared: Tables | Unbiased, samples: int = 64) -> Maps:
+def flat_maps(photo: Array, renderer: Renderer, samples: int = 64) -> Maps:
     """Maps of a flat sample for a photo (H, W, 3) of it, linear radiance."""
     height, width = photo.shape[:2]
-    terms = plane_terms(prepared, height, width, USUAL_ROUGHNESS, samples)
+    terms = plane_terms(renderer, height, width, USUAL_ROUGHNESS, samples)
     k_s = np.full(3, USUAL_SPECULAR)
     maps = constant_maps(height, width, 0.0, k_s, USUAL_ROUGHNESS)
     maps.diffuse = diffuse_rest(photo, terms, k_s)
@@ -35,12 +34,12 @@ def diffuse_rest(photo: Array, terms: tuple[Array, Array, Array], k_s: Array) ->
 
 
 def plane_terms(
-    prepared: Tables | Unbiased, height: int, width: int, rho: float, samples: int
+    renderer: Renderer, height: int, width: int, rho: float, samples: int
 ) -> tuple[Array, Array, Array]:
     """E, B and A of I = k_d·E/π + k_s·B + A for a flat sample, each (H, W, 3)."""
-    scalar = prepared.scene.scalar
-    view = make_view(prepared.scene, height, width)
-    shading = shade(prepared, view, dr.opaque(scalar, rho), vector(scalar, 3)(0, 0, 1), samples)
+    scalar = renderer.scene.scalar
+    view = make_view(renderer.scene, height, width)
+    shading = renderer.shade(view, dr.opaque(scalar, rho), vector(scalar, 3)(0, 0, 1), samples)
     parts = shading.irradiance, shading.b, shading.a
     dr.eval(parts)  # one launch for all
     e, b, a = (np.asarray(x).T.reshape(height, width, 3) for x in parts)

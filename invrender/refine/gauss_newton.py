@@ -29,8 +29,7 @@ from invrender.maps import Maps
 from invrender.refine.priors import Prior
 from invrender.refine.theta import N, R, project, to_maps
 from invrender.render.backend import Float, dr, vector
-from invrender.render.fast.tables import Tables
-from invrender.render.renderer import Material, Unbiased, pixel_jacobian
+from invrender.render.renderer import Material, Renderer
 from invrender.render.scene import aligned, make_view
 from invrender.types import Array
 
@@ -50,7 +49,7 @@ class Shot:
     """
 
     photo: Array
-    prepared: Tables | Unbiased
+    renderer: Renderer
     clipped: NDArray[np.bool_] | None = None
 
 
@@ -69,7 +68,7 @@ class Refined:
 
 
 def linearise(
-    prepared: Tables | Unbiased,
+    renderer: Renderer,
     theta: Array,
     samples: int,
     seed: int = 0,
@@ -85,9 +84,9 @@ def linearise(
     vec3 = vector(Float, 3)
     diffuse, specular = (vec3(aligned(x, Float)) for x in (flat[:3], flat[3:6]))
     rho, p, q = (Float(aligned(x, Float)) for x in flat[6:])
-    view = make_view(prepared.scene, height or h, w, seed, top * w, h * w)
+    view = make_view(renderer.scene, height or h, w, seed, top * w, h * w)
     material = Material(diffuse, specular, rho, vec3(p, q, Float(1)))
-    j = pixel_jacobian(prepared, view, material, samples)
+    j = renderer.pixel_jacobian(view, material, samples)
     slope_p = j.tangent_s * j.s.x + j.tangent_t * j.t.x
     slope_q = j.tangent_s * j.s.y + j.tangent_t * j.t.y
     dr.eval(j.radiance, j.diffuse, j.specular, j.roughness, slope_p, slope_q)
@@ -130,7 +129,7 @@ class _Band:
         """photo - I(θ) and the Jacobian (H, W, 3·shots, 9)."""
         height = len(self.shots[0].photo)
         parts = [
-            linearise(s.prepared, theta, self.samples, top=self.rows.start, height=height)
+            linearise(s.renderer, theta, self.samples, top=self.rows.start, height=height)
             for s in self.shots
         ]
         image, jacobian = (np.concatenate(x, 2) for x in zip(*parts, strict=True))

@@ -23,8 +23,7 @@ from scipy.ndimage import uniform_filter
 from invrender.colour import AXES
 from invrender.maps import Maps
 from invrender.refine.flat import USUAL_ROUGHNESS, USUAL_SPECULAR, diffuse_rest, plane_terms
-from invrender.render.fast.tables import Tables
-from invrender.render.renderer import Unbiased
+from invrender.render.renderer import Renderer
 from invrender.sampling import resize
 from invrender.types import Array
 
@@ -90,24 +89,22 @@ class Lobes:
     costs: Array
 
 
-def lobe_terms(
-    prepared: Tables | Unbiased, height: int, width: int, samples: int = 64
-) -> list[list[Array]]:
+def lobe_terms(renderer: Renderer, height: int, width: int, samples: int = 64) -> list[list[Array]]:
     """E, B and A of a photo's pixels as it is fitted, for each of `ROUGHNESS`."""
     h, w = min(FIT_SIZE, height), min(FIT_SIZE, width)
-    return [_terms(prepared, h, w, float(rho), samples) for rho in ROUGHNESS]
+    return [_terms(renderer, h, w, float(rho), samples) for rho in ROUGHNESS]
 
 
-def fit_lobes(photo: Array, prepared: Tables | Unbiased, samples: int = 64) -> Maps:
+def fit_lobes(photo: Array, renderer: Renderer, samples: int = 64) -> Maps:
     """Maps of a flat sample with up to `MATERIALS` lobes for a photo (H, W, 3), linear radiance."""
-    terms = lobe_terms(prepared, photo.shape[0], photo.shape[1], samples)
+    terms = lobe_terms(renderer, photo.shape[0], photo.shape[1], samples)
     lobes = _search(_small(photo), terms)[2]
-    return _maps(photo, lobes, _full_terms(photo, prepared, samples, terms, lobes))[0]
+    return _maps(photo, lobes, _full_terms(photo, renderer, samples, terms, lobes))[0]
 
 
 def read_lobes(
     photo: Array,
-    prepared: Tables | Unbiased,
+    renderer: Renderer,
     samples: int = 64,
     terms: list[list[Array]] | None = None,
 ) -> Lobes:
@@ -115,12 +112,12 @@ def read_lobes(
 
     terms: `lobe_terms` of these lights, where several photos are taken under them.
     """
-    terms = terms or lobe_terms(prepared, photo.shape[0], photo.shape[1], samples)
+    terms = terms or lobe_terms(renderer, photo.shape[0], photo.shape[1], samples)
     small = _small(photo)
     moments, label, lobes = _search(small, terms)
     either = [_either(moments, label == k) for k in range(len(lobes))]
     every = [*lobes, *(f for e in either for f in e.lobes)]
-    full = _full_terms(photo, prepared, samples, terms, every)
+    full = _full_terms(photo, renderer, samples, terms, every)
     maps, label = _maps(photo, lobes, full)
     sample, texture = _either(moments, np.ones(small.shape[:2], bool)), _by_texture(small, terms)
     costs = np.stack([c - c.min() for c in (sample.costs, texture)])
@@ -152,14 +149,14 @@ def _search(photo: Array, terms: list[list[Array]]) -> tuple[Array, Labels, list
 
 
 def _full_terms(
-    photo: Array, prepared: Tables | Unbiased, samples: int, terms: list[list[Array]],
+    photo: Array, renderer: Renderer, samples: int, terms: list[list[Array]],
     lobes: list[Lobe],
 ) -> dict[int, list[Array]]:  # fmt: skip
     """E, B and A of all of a photo's pixels, by the lobes' ρ."""
     height, width = photo.shape[:2]
     return {
         rho: terms[rho] if terms[rho][0].shape == photo.shape
-        else _terms(prepared, height, width, float(ROUGHNESS[rho]), samples)
+        else _terms(renderer, height, width, float(ROUGHNESS[rho]), samples)
         for rho in {f.rho for f in lobes}
     }  # fmt: skip
 
@@ -202,12 +199,10 @@ def _squashed(odds: Array) -> Array:
     return np.arcsinh(odds / 10)
 
 
-def _terms(
-    prepared: Tables | Unbiased, height: int, width: int, rho: float, samples: int
-) -> list[Array]:
+def _terms(renderer: Renderer, height: int, width: int, rho: float, samples: int) -> list[Array]:
     """`plane_terms`, for wide lobes from a coarse grid."""
     h, w = (height, width) if rho < SMOOTH else (min(GRID, height), min(GRID, width))
-    return [resize(x, height, width) for x in plane_terms(prepared, h, w, rho, samples)]
+    return [resize(x, height, width) for x in plane_terms(renderer, h, w, rho, samples)]
 
 
 def _centres(n: int, of: int) -> Labels:

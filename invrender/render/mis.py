@@ -11,6 +11,7 @@ from scipy.ndimage import maximum_filter
 
 from invrender.render import brdf
 from invrender.render.backend import dr, vector
+from invrender.render.renderer import Renderer
 from invrender.render.scene import (
     Scene,
     View,
@@ -95,6 +96,21 @@ class EnvironmentSampler:
         # cos a - cos b = 2 sin((a + b)/2) sin((b - a)/2), without cancellation
         band = 2 * dr.sin((scalar(row) + 0.5) * (dr.pi / h)) * math.sin(0.5 * math.pi / h)
         return dr.gather(scalar, self.density, texel) / (band * h * 2 * dr.pi)
+
+
+class Mis(Renderer):
+    """The unbiased estimator, prepared for a scene.
+
+    sampler: of another scene whose environment has the same shares, where they must not change.
+    """
+
+    def __init__(self, scene: Scene, sampler: EnvironmentSampler | None = None) -> None:
+        self.scene, self.sampler = scene, sampler or EnvironmentSampler.build(scene)
+
+    def _shade(
+        self, view: View, roughness: Any, normal: Any, samples: int, jacobian: bool
+    ) -> Shading:
+        return shade_mis(self.scene, self.sampler, view, roughness, normal, samples, jacobian)
 
 
 def shade_mis(

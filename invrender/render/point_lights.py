@@ -12,7 +12,7 @@ import numpy as np
 from invrender.maps import Maps
 from invrender.render import brdf
 from invrender.render.backend import Float, dr, vector
-from invrender.render.renderer import MIN_ROUGHNESS, Material, material_from_maps
+from invrender.render.renderer import MIN_ROUGHNESS, Material
 from invrender.rig import Rig
 from invrender.types import Array
 
@@ -47,7 +47,7 @@ def relight(maps: Maps, rig: Rig, lights: Array) -> Array:
     """
     height, width = maps.shape
     vec3 = vector(Float, 3)
-    material = material_from_maps(maps)
+    material = Material.from_maps(maps)
     x = vec3(rig.sample_points(height, width).reshape(-1, 3).T.astype(np.float32))
     place = lambda p: vec3(*(dr.opaque(Float, float(c)) for c in p))  # noqa: E731
     v = dr.normalize(place(rig.camera) - x)

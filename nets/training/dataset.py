@@ -27,8 +27,8 @@ from invrender.data.materials import find_materials
 from invrender.maps import Maps
 from invrender.refine.lobes import lobe_terms, read_lobes
 from invrender.render.backend import dr
-from invrender.render.fast.tables import Tables
-from invrender.render.renderer import Unbiased, material_from_maps, prepare, radiance
+from invrender.render.fast.estimator import Fast
+from invrender.render.renderer import Material, Renderer
 from invrender.render.scene import make_scene, make_view
 from invrender.sphere import scale_environment
 from invrender.tasks import map_tasks
@@ -81,16 +81,16 @@ def make_group(rng: np.random.Generator, options: Options) -> list[Sample]:
 
     size = options.size
     # Light adds up: the room beside a dark screen, and the screen alone as it is and should be.
-    room = prepare(make_scene(true, np.ones_like(pattern), env, gain=0.0))
-    screens = [prepare(make_scene(true, p, None, g)) for p, g in ((shown, 1.0), (pattern, gain))]
-    known_lights = prepare(make_scene(known, pattern, seen, gain))
+    room = Fast(make_scene(true, np.ones_like(pattern), env, gain=0.0))
+    screens = [Fast(make_scene(true, p, None, g)) for p, g in ((shown, 1.0), (pattern, gain))]
+    known_lights = Fast(make_scene(known, pattern, seen, gain))
     terms = lobe_terms(known_lights, size, size, options.samples)
     out = []
     for _ in range(options.per_room):
         maps = draw_material(rng, options)
-        material = material_from_maps(maps, whole=True)
+        material = Material.from_maps(maps)
         view = make_view(room.scene, size, size, seed=int(rng.integers(2**31)))
-        parts = [radiance(p, view, material, options.samples) for p in (room, *screens)]
+        parts = [p.radiance(view, material, options.samples) for p in (room, *screens)]
         dr.eval(parts)
         a, b, c = (np.asarray(p).T.reshape(size, size, 3) for p in parts)
         photo = sensor(rng, a + b)
@@ -108,7 +108,7 @@ def make_group(rng: np.random.Generator, options: Options) -> list[Sample]:
 
 
 def _for_correction(
-    sample: Sample, unit: float, prepared: Tables | Unbiased, lobes: Maps, options: Options
+    sample: Sample, unit: float, renderer: Renderer, lobes: Maps, options: Options
 ) -> Sample:
     """What a network makes of a capture, as the correction sees it."""
     batch = {
@@ -118,7 +118,7 @@ def _for_correction(
     found = estimate_of(predict(network_cached(options.network), batch), unit)
     photo = np.moveaxis(sample["photo"].astype(np.float32), 0, -1) * unit
     clipped = (photo >= 0.999 * photo.max()).any(-1)
-    seen = linearised(photo, prepared, found, lobes, clipped, options.samples)
+    seen = linearised(photo, renderer, found, lobes, clipped, options.samples)
     out = {k: np.clip(v, -6e4, 6e4).astype(np.float16) for k, v in seen.items() if k != "position"}
     return {**out, "maps": sample["maps"]}
 

@@ -4,17 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from forward_scenes import some_environment, some_maps, some_pattern
+from forward_scenes import ESTIMATORS, rendered, some_environment, some_maps, some_pattern
 
 from invrender.maps import Maps, constant_maps
-from invrender.render import renderer as render
 from invrender.render.backend import dr
-from invrender.render.renderer import material_from_maps
+from invrender.render.fast.estimator import Fast
+from invrender.render.renderer import Material
 from invrender.render.scene import make_scene, make_view
 from invrender.rig import Rig
 from invrender.types import InputError
 
-ESTIMATORS = ["fast", "mis"]
 GAIN = (4.0, 3.0, 5.0)
 
 
@@ -30,8 +29,8 @@ def test_constant_environment(estimator):
         a = np.radians(degrees)
         scene = make_scene(Rig(), None, env)
         view = make_view(scene, 8, 8)
-        m = material_from_maps(diffuse_only(normal=(np.sin(a), 0, np.cos(a))))
-        shading = render.shade(render.prepare(scene, estimator), view, m.roughness, m.normal, 256)
+        m = Material.from_maps(diffuse_only(normal=(np.sin(a), 0, np.cos(a))))
+        shading = ESTIMATORS[estimator](scene).shade(view, m.roughness, m.normal, 256)
         e = np.array(shading.irradiance)
         assert e.mean() == pytest.approx(2 * np.pi * (1 + np.cos(a)) / 2, rel=5e-3)
         assert np.abs(e / e.mean() - 1).max() < (0.01 if estimator == "fast" else 0.05)
@@ -57,9 +56,9 @@ def test_screen_form_factor(estimator, tilt):
     a = np.radians(tilt)
     normal = np.array([-np.sin(a), 0, np.cos(a)])
     scene = make_scene(rig, np.ones((4, 4, 3)), None)
-    m = material_from_maps(diffuse_only(4, normal))
-    shading = render.shade(
-        render.prepare(scene, estimator), make_view(scene, 4, 4), m.roughness, m.normal, 2048
+    m = Material.from_maps(diffuse_only(4, normal))
+    shading = ESTIMATORS[estimator](scene).shade(
+        make_view(scene, 4, 4), m.roughness, m.normal, 2048
     )
     expected = [form_factor(rig, x, normal) for x in rig.sample_points(4, 4).reshape(-1, 3)]
     assert np.allclose(np.array(shading.irradiance)[0], expected, rtol=4e-3)
@@ -73,7 +72,7 @@ def test_mirror_shows_the_pattern_and_the_environment(estimator):
     maps = constant_maps(n, n, 0.0, 1.0, 0.01)
     ramp = np.linspace(0, 1, 64)
     pattern = np.stack(np.broadcast_arrays(ramp[None, :], ramp[::-1, None], 0.5), -1)
-    image = render.render(rig, maps, pattern, None, estimator=estimator, samples=1024)
+    image = rendered(rig, maps, pattern, None, estimator=estimator, samples=1024)
     points = rig.sample_points(n, n)
     away = points - rig.camera
     hit = points + away * [1, 1, -1] * (rig.screen_height / rig.camera[2])
@@ -88,7 +87,7 @@ def test_mirror_shows_the_pattern_and_the_environment(estimator):
     env[:, :16] = 0.75  # towards +y
     a = np.radians(35.0)
     maps = constant_maps(1, 1, 0.0, 1.0, 0.02, (0, np.sin(a), np.cos(a)))
-    image = render.render(rig, maps, pattern, env, estimator=estimator, samples=64)
+    image = rendered(rig, maps, pattern, env, estimator=estimator, samples=64)
     assert image[0, 0] == pytest.approx([0.75] * 3, rel=0.02)
 
 
@@ -98,16 +97,16 @@ def test_dark_scenes(estimator):
     maps = some_maps(8, "glossy")
     env = np.full((16, 32, 3), 1.0)
     black = np.zeros((4, 4, 3))
-    dark = render.render(Rig(), maps, None, None, estimator=estimator)
+    dark = rendered(Rig(), maps, None, None, estimator=estimator)
     assert dark.shape == (8, 8, 3) and not dark.any()
-    assert not render.render(Rig(), maps, black, 0 * env, estimator=estimator).any()
-    with_screen = render.render(Rig(), maps, black, env, estimator=estimator, samples=256)
-    without = render.render(Rig(), maps, None, env, estimator=estimator, samples=256)
+    assert not rendered(Rig(), maps, black, 0 * env, estimator=estimator).any()
+    with_screen = rendered(Rig(), maps, black, env, estimator=estimator, samples=256)
+    without = rendered(Rig(), maps, None, env, estimator=estimator, samples=256)
     assert with_screen.mean() < 0.8 * without.mean()
-    unlit = render.render(Rig(), maps, 1 - black, env, 0.0, estimator=estimator, samples=256)
+    unlit = rendered(Rig(), maps, 1 - black, env, 0.0, estimator=estimator, samples=256)
     assert np.array_equal(with_screen, unlit)
     black_maps = constant_maps(8, 8, 0.0, 0.0, 1.0)
-    only_schlick = render.render(Rig(), black_maps, None, env, estimator=estimator, samples=256)
+    only_schlick = rendered(Rig(), black_maps, None, env, estimator=estimator, samples=256)
     assert 0 < only_schlick.mean() < 0.02
 
 
@@ -116,7 +115,7 @@ def test_what_a_scene_lacks_changes_nothing(estimator):
     """The specialised kernel of a part equals the general one with that part's light at zero."""
     maps = some_maps(16, "glossy")
     pattern, env = some_pattern(), some_environment()
-    run = lambda p, e: render.render(  # noqa: E731
+    run = lambda p, e: rendered(  # noqa: E731
         Rig(), maps, p, e, GAIN, estimator=estimator, samples=512
     )
     both, screen = run(pattern, env), run(pattern, None)
@@ -127,8 +126,8 @@ def test_what_a_scene_lacks_changes_nothing(estimator):
     wide = replace(constant, roughness=constant.roughness.copy())
     wide.roughness[0, 0] += 1e-6  # no longer constant: a full-size array
     wide.diffuse[0, 0] += 1e-6
-    a = render.render(Rig(), constant, pattern, env, estimator=estimator)
-    b = render.render(Rig(), wide, pattern, env, estimator=estimator)
+    a = rendered(Rig(), constant, pattern, env, estimator=estimator)
+    b = rendered(Rig(), wide, pattern, env, estimator=estimator)
     assert np.allclose(a, b, rtol=1e-4)
 
 
@@ -136,9 +135,9 @@ def test_what_a_scene_lacks_changes_nothing(estimator):
 def test_tiles_change_nothing(estimator, monkeypatch):
     maps, pattern, env = some_maps(32, "tilted"), some_pattern(), some_environment()
     args = (Rig(), maps, pattern, env)
-    whole = render.render(*args, estimator=estimator, samples=16)
-    monkeypatch.setattr(render, "TILE", 300)
-    assert np.allclose(whole, render.render(*args, estimator=estimator, samples=16), rtol=1e-5)
+    whole = rendered(*args, estimator=estimator, samples=16)
+    monkeypatch.setattr("invrender.render.renderer.TILE", 300)
+    assert np.allclose(whole, rendered(*args, estimator=estimator, samples=16), rtol=1e-5)
 
 
 @pytest.mark.parametrize("unit", [1e-3, 1e3])
@@ -150,8 +149,7 @@ def test_units_do_not_matter(unit):
     maps, pattern, env = some_maps(16, "glossy"), some_pattern(), some_environment()
     for estimator in ESTIMATORS:
         a, b = (
-            render.render(r, maps, pattern, env, estimator=estimator, samples=32)
-            for r in (rig, scaled)
+            rendered(r, maps, pattern, env, estimator=estimator, samples=32) for r in (rig, scaled)
         )
         assert np.abs(a - b).max() < 2e-3 * a.max(), estimator
 
@@ -179,9 +177,7 @@ def test_mis_agrees_with_mitsuba(kind):
     )
     ours = np.array(
         [
-            pooled(
-                render.render(rig, maps, pattern, env, GAIN, estimator="mis", samples=64, seed=s)
-            )
+            pooled(rendered(rig, maps, pattern, env, GAIN, estimator="mis", samples=64, seed=s))
             for s in range(runs)
         ]
     )
@@ -206,7 +202,7 @@ def test_fast_approaches_mis(kind):
     """RMS difference over the image, under small bright lamps that the screen's edge cuts."""
     n = 48
     maps, pattern, env = some_maps(n, kind), some_pattern(64), some_environment(64)
-    run = lambda estimator, samples, seed: render.render(  # noqa: E731
+    run = lambda estimator, samples, seed: rendered(  # noqa: E731
         Rig(), maps, pattern, env, GAIN, estimator=estimator, samples=samples, seed=seed
     )
     halves = [np.mean([run("mis", 1024, s + k) for s in range(4)], 0) for k in (0, 10)]
@@ -234,11 +230,11 @@ def test_a_sun_in_a_near_mirror(roughness, few, many):
     column = np.arctan2(d[1], d[0]) % (2 * np.pi) / np.pi * h
     env[int(np.arccos(d[2]) / np.pi * h), int(column)] = 2000
     scene = make_scene(rig, some_pattern(64), env)
-    material = material_from_maps(maps)
+    material = Material.from_maps(maps)
 
     def jacobian(estimator, samples, seed):
-        prepared = render.prepare(scene, estimator)
-        j = render.pixel_jacobian(prepared, make_view(scene, n, n, seed), material, samples)
+        renderer = ESTIMATORS[estimator](scene)
+        j = renderer.pixel_jacobian(make_view(scene, n, n, seed), material, samples)
         return [np.array(x) for x in (j.radiance, j.roughness, j.tangent_s, j.tangent_t)]
 
     runs = [jacobian("mis", 2048, seed) for seed in range(4)]
@@ -256,7 +252,7 @@ def test_fast_is_exact_without_lamps():
     """Where no light is small, the error falls with samples to the tables' own, below 0.2%."""
     n = 32
     maps, pattern, env = some_maps(n, "metal"), some_pattern(64), some_environment(32, 0, 0, 0)
-    run = lambda estimator, samples, seed: render.render(  # noqa: E731
+    run = lambda estimator, samples, seed: rendered(  # noqa: E731
         Rig(), maps, pattern, env, GAIN, estimator=estimator, samples=samples, seed=seed
     )
     reference = np.mean([run("mis", 4096, s) for s in range(6)], 0)
@@ -270,11 +266,11 @@ def test_detail_lowers_the_error_of_the_tables():
     """Irradiance has no samples: its error is the tables', and falls with their size."""
     n = 24
     scene = make_scene(Rig(), some_pattern(64), some_environment(32, 0, 0, 0), GAIN)
-    m, view = material_from_maps(some_maps(n, "rough")), make_view(scene, n, n)
+    m, view = Material.from_maps(some_maps(n, "rough")), make_view(scene, n, n)
 
     def irradiance(detail):
-        prepared = render.prepare(scene, "fast", detail)
-        return np.array(render.shade(prepared, view, m.roughness, m.normal, 1).irradiance)
+        renderer = Fast(scene, detail)
+        return np.array(renderer.shade(view, m.roughness, m.normal, 1).irradiance)
 
     finest = irradiance(4)
     errors = [np.sqrt(np.mean((irradiance(k) - finest) ** 2)) / finest.mean() for k in (1, 2)]
@@ -294,10 +290,10 @@ def test_nothing_is_recompiled(estimator):
         env[8, ::13] += 50 + k
         scene = make_scene(rig, rng.uniform(0, 1, (16, 16, 3)), env, 1.0 + k, 2.0 + k)
         view = make_view(scene, 16, 16, seed=k)
-        prepared = render.prepare(scene, estimator)
-        material = material_from_maps(maps)
-        dr.eval(render.radiance(prepared, view, material, 8 + k))
-        render.pixel_jacobian(prepared, view, material, 9 + k)
+        renderer = ESTIMATORS[estimator](scene)
+        material = Material.from_maps(maps)
+        dr.eval(renderer.radiance(view, material, 8 + k))
+        renderer.pixel_jacobian(view, material, 9 + k)
 
     call(0)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
@@ -319,8 +315,6 @@ def test_inputs_are_checked():
         make_scene(Rig(), -good, None)
     with pytest.raises(InputError, match="negative or non-finite"):
         make_scene(Rig(), good * np.nan, None)
-    with pytest.raises(ValueError, match="estimator"):
-        render.prepare(make_scene(Rig(), good, None), "best")
 
 
 @pytest.mark.slow
@@ -332,6 +326,6 @@ def test_4096_in_bounded_memory():
     small = some_maps(64, "glossy")
     grow = lambda a: np.repeat(np.repeat(a, n // 64, 0), n // 64, 1)  # noqa: E731
     maps = Maps(*(grow(getattr(small, k)) for k in ("diffuse", "specular", "roughness", "normal")))
-    image = render.render(Rig(), maps, some_pattern(), some_environment(), samples=4)
+    image = rendered(Rig(), maps, some_pattern(), some_environment(), samples=4)
     assert np.all(np.isfinite(image))
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < 4 << 20

@@ -5,16 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from forward_scenes import (
+    ESTIMATORS,
     configuration_view,
     extreme_configurations,
     some_environment,
     some_pattern,
 )
 
+from invrender.maps import constant_maps
 from invrender.render import brdf
-from invrender.render import renderer as render
 from invrender.render.backend import Float, ad, dr, vector
-from invrender.render.mis import shade_mis
+from invrender.render.fast.estimator import Fast
+from invrender.render.mis import Mis, shade_mis
+from invrender.render.renderer import Material, _compose
 from invrender.render.scene import make_scene, make_view
 from invrender.rig import Rig
 
@@ -55,11 +58,11 @@ def worst(found, expected, scale, report, where):
     return error
 
 
-def shading_of(estimator, prepared, view, rho, n, samples, at):
+def shading_of(estimator, renderer, view, rho, n, samples, at):
     """Shading with mis's directions held where the configuration has them."""
     if estimator == "fast":
-        return render.shade(prepared, view, rho, n, samples)
-    return shade_mis(prepared.scene, prepared.sampler, view, rho, n, samples, proposal=at)
+        return renderer.shade(view, rho, n, samples)
+    return shade_mis(renderer.scene, renderer.sampler, view, rho, n, samples, proposal=at)
 
 
 SLOW = pytest.mark.slow  # more kernels to compile, no more code to cover
@@ -81,16 +84,16 @@ def test_map_derivatives(estimator, lights, capsys):
     share of 0.2% of the configurations may disagree by more than 1e-5; mis must agree everywhere.
     """
     scene = a_scene(lights)
-    prepared = render.prepare(scene, estimator)
+    renderer = ESTIMATORS[estimator](scene)
     view, m = configuration_view(scene, extreme_configurations(N, seed=7))
     samples = 16
-    j = render.pixel_jacobian(prepared, view, m, samples)
+    j = renderer.pixel_jacobian(view, m, samples)
     s, t = brdf.frame(m.normal)
     at = (m.roughness, m.normal)
 
     def image(rho, n):
-        shading = shading_of(estimator, prepared, view, rho, n, samples, at)
-        return numpy(render._compose(m.diffuse, m.specular, shading))
+        shading = shading_of(estimator, renderer, view, rho, n, samples, at)
+        return numpy(_compose(m.diffuse, m.specular, shading))
 
     rho = numpy(m.roughness)
     step = 2e-6 * rho
@@ -123,18 +126,18 @@ def test_map_derivatives(estimator, lights, capsys):
     # Affine in the albedos: the difference quotient is exact.
     for name in ("diffuse", "specular"):
         other = replace(m, **{name: getattr(m, name) + 0.5})
-        quotient = (numpy(render.radiance(prepared, view, other, samples)) - value) / 0.5
+        quotient = (numpy(renderer.radiance(view, other, samples)) - value) / 0.5
         found = numpy(getattr(j, name))
         assert np.allclose(found, quotient, rtol=1e-9, atol=1e-9 * value.max())
 
     # Reverse and forward mode of `radiance` are this Jacobian, applied.
     rng = np.random.default_rng(0)
     weights = vector(Float64, 3)(rng.standard_normal((3, N)))
-    leaves = render.Material(*(type(v)(v) for v in (m.diffuse, m.specular, m.roughness, m.normal)))
+    leaves = Material(*(type(v)(v) for v in (m.diffuse, m.specular, m.roughness, m.normal)))
     names = ("diffuse", "specular", "roughness", "normal")
     for name in names:
         dr.enable_grad(getattr(leaves, name))
-    color = render.radiance(prepared, view, leaves, samples)
+    color = renderer.radiance(view, leaves, samples)
     dr.backward(dr.sum(dr.dot(color, weights)))
     expected_grad = {
         "diffuse": j.diffuse * weights,
@@ -152,7 +155,7 @@ def test_map_derivatives(estimator, lights, capsys):
     ):
         leaf = type(tangent)(getattr(m, name))
         dr.enable_grad(leaf)
-        color = render.radiance(prepared, view, replace(m, **{name: leaf}), samples)
+        color = renderer.radiance(view, replace(m, **{name: leaf}), samples)
         dr.set_grad(leaf, tangent)
         forward = numpy(dr.forward_to(color))
         if name == "roughness":
@@ -177,7 +180,7 @@ def test_float32_derivatives(estimator, capsys):
     for scalar in (Float64, Float):
         scene = a_scene(lights, scalar)
         view, m = configuration_view(scene, c)
-        results[scalar] = render.pixel_jacobian(render.prepare(scene, estimator), view, m, 32)
+        results[scalar] = ESTIMATORS[estimator](scene).pixel_jacobian(view, m, 32)
     lines = []
     rho = c["roughness"]
     value = numpy(results[Float64].radiance)
@@ -200,12 +203,12 @@ def light_gradient(estimator, field, index):
     view, m = configuration_view(scene, extreme_configurations(256, seed=1))
     m.roughness = dr.maximum(m.roughness, 0.1)
     weights = np.random.default_rng(1).uniform(0.5, 1.5, (3, 256))
-    sampler = render.prepare(scene, "mis").sampler
+    sampler = Mis(scene).sampler
 
     def total(scene):
         # The sampler would follow the environment: hold it.
-        prepared = render.prepare(scene) if estimator == "fast" else render.Unbiased(scene, sampler)
-        color = render.radiance(prepared, view, m, 32)
+        renderer = Fast(scene) if estimator == "fast" else Mis(scene, sampler)
+        color = renderer.radiance(view, m, 32)
         return dr.sum(dr.dot(color, vector(Float64, 3)(weights)))
 
     leaf = type(getattr(scene, field))(getattr(scene, field))
@@ -284,11 +287,11 @@ def pose_tangent(lights, field, axis):
 def test_pose_derivatives_fast(field, axis):
     """Pixel by pixel: the fast estimator's edges are soft, so its derivative has no jumps."""
     n, samples = 16, 16
-    m = render.Material(0.4, 0.3, Float64(0.35), vector(Float64, 3)(0.1, -0.2, 1))
+    m = Material(0.4, 0.3, Float64(0.35), vector(Float64, 3)(0.1, -0.2, 1))
 
     def image(scene):
         view = make_view(scene, n, n)
-        return render.radiance(render.prepare(scene), view, m, samples)
+        return Fast(scene).radiance(view, m, samples)
 
     scene, leaves = pose_tangent("both", field, axis)
     color = image(scene)
@@ -314,11 +317,11 @@ def test_pose_derivatives_mis(field, axis):
     samples where it is 0.05% here), not wrong.
     """
     n = 24
-    m = render.Material(0.4, 0.3, Float64(0.5), vector(Float64, 3)(0.1, -0.2, 1))
+    m = Material(0.4, 0.3, Float64(0.5), vector(Float64, 3)(0.1, -0.2, 1))
 
     def image(scene, samples, seed=0):
         view = make_view(scene, n, n, seed)
-        return render.radiance(render.prepare(scene, "mis"), view, m, samples)
+        return Mis(scene).radiance(view, m, samples)
 
     scene, leaves = pose_tangent("smooth", field, axis)
     color = image(scene, 256)
@@ -350,10 +353,30 @@ def test_gradients_of_maps_and_lights_together():
         gain = vector(Float64, 3)(scene.gain)
         if with_gain:
             dr.enable_grad(gain)
-        prepared = render.prepare(replace(scene, gain=gain))
-        color = render.radiance(prepared, view, replace(m, roughness=rho, normal=n), 16)
+        renderer = Fast(replace(scene, gain=gain))
+        color = renderer.radiance(view, replace(m, roughness=rho, normal=n), 16)
         dr.backward(dr.sum(dr.squared_norm(color)))
         return numpy(dr.grad(rho)), numpy(dr.grad(n))
 
     for a, b in zip(grads(False), grads(True), strict=True):
         assert np.allclose(a, b, rtol=1e-7, atol=1e-9 * np.abs(a).max())
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_a_constant_map_has_a_gradient_in_every_pixel(estimator):
+    """Each is that pixel's own, as its Jacobian has it: none is shared, and none is a sum."""
+    scene = make_scene(Rig(), some_pattern(), some_environment(), 5.0)
+    renderer, view = ESTIMATORS[estimator](scene), make_view(scene, 5, 7)
+    leaves = Material.from_maps(constant_maps(5, 7))
+    dr.enable_grad(leaves.diffuse, leaves.specular, leaves.roughness, leaves.normal)
+    dr.backward(dr.sum(dr.sum(renderer.radiance(view, leaves, 16))))
+    j = renderer.pixel_jacobian(view, dr.detach(leaves), 16)
+    assert dr.width(dr.grad(leaves.roughness)) == 35
+    assert np.array(dr.grad(leaves.normal)).shape == (3, 35)
+    for gradient, own in (
+        (leaves.roughness, dr.sum(j.roughness)),
+        (leaves.diffuse, j.diffuse),
+        (leaves.specular, j.specular),
+    ):
+        assert np.allclose(np.array(dr.grad(gradient)), np.array(own), rtol=1e-6)
+        assert np.array(own).std(-1).min() > 0  # the pixels differ

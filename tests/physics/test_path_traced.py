@@ -1,10 +1,9 @@
 import numpy as np
 import pytest
-from forward_scenes import some_environment, some_maps, some_pattern
+from forward_scenes import rendered, some_environment, some_maps, some_pattern
 
 from invrender.maps import constant_maps
 from invrender.render import path_traced as photograph
-from invrender.render import renderer as render
 from invrender.rig import Rig
 
 
@@ -31,7 +30,7 @@ def test_whole_photograph_agrees_on_the_sample():
     photo = photograph.photograph(
         rig, maps, pattern, env, 3.0, height=width // 2, width=width, spp=32, max_depth=2, table=0.0
     )
-    ours = render.render(rig, maps, pattern, env, 3.0, samples=256)
+    ours = rendered(rig, maps, pattern, env, 3.0, samples=256)
     seen = sample_region(rig, photo, n)
     difference = np.abs(seen - ours).mean() / ours.mean()
     assert difference < 0.02, difference

@@ -6,20 +6,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from forward_scenes import (
+    ESTIMATORS,
     configuration_view,
     extreme_configurations,
+    rendered,
     some_environment,
     some_pattern,
 )
 
 from invrender.maps import constant_maps
-from invrender.render import renderer as render
 from invrender.render.backend import Float, ad
-from invrender.render.scene import make_scene
+from invrender.render.renderer import Material
+from invrender.render.scene import make_scene, make_view
 from invrender.rig import Rig
 
 Float64 = ad.Float64
-ESTIMATORS = ["fast", "mis"]
 
 
 def sunny(radiance=1e5):
@@ -69,7 +70,7 @@ def jacobian(estimator, scene_name, c, scalar, samples=16):
     rig, pattern, environment = SCENES[scene_name]
     scene = make_scene(rig, pattern, environment, scalar=scalar)
     view, m = configuration_view(scene, c)
-    j = render.pixel_jacobian(render.prepare(scene, estimator), view, m, samples)
+    j = ESTIMATORS[estimator](scene).pixel_jacobian(view, m, samples)
     return {k: np.array(v, np.float64) for k, v in j.__dict__.items() if k not in "st"}
 
 
@@ -121,11 +122,9 @@ def test_no_energy_is_created(estimator, roughness):
         maps.normal /= np.linalg.norm(maps.normal, axis=-1, keepdims=True)
         for pattern in (None, np.ones((4, 4, 3))):
             scene = make_scene(Rig(), pattern, env)
-            view = render.make_view(scene, 32, 32)
-            m = render.material_from_maps(maps)
-            shading = render.shade(
-                render.prepare(scene, estimator), view, m.roughness, m.normal, 256
-            )
+            view = make_view(scene, 32, 32)
+            m = Material.from_maps(maps)
+            shading = ESTIMATORS[estimator](scene).shade(view, m.roughness, m.normal, 256)
             lobe = (
                 np.array(shading.irradiance) / np.pi if diffuse else np.array(shading.b + shading.a)
             )
@@ -148,9 +147,9 @@ def test_no_clamp_kills_a_gradient(estimator):
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_one_pixel_maps(estimator):
     rig, pattern, env = SCENES["ordinary"]
-    image = render.render(rig, constant_maps(1, 1), pattern, env, estimator=estimator)
+    image = rendered(rig, constant_maps(1, 1), pattern, env, estimator=estimator)
     assert image.shape == (1, 1, 3) and np.all(np.isfinite(image)) and image.min() > 0
-    row = render.render(rig, constant_maps(1, 7), pattern, env, estimator=estimator)
+    row = rendered(rig, constant_maps(1, 7), pattern, env, estimator=estimator)
     assert row.shape == (1, 7, 3) and row.min() > 0
 
 

@@ -13,7 +13,7 @@ from invrender.files.rig_toml import write_rig
 from invrender.files.write import write_exr
 from invrender.maps import constant_maps
 from invrender.pipeline import Stages, recover, refine_capture, see
-from invrender.render.renderer import render
+from invrender.render import Fast, make_scene
 from invrender.rig import Rig
 
 RIG, SIZE, GAIN = Rig(), 24, (2.0, 2.1, 1.9)
@@ -23,7 +23,7 @@ def capture(folder, truth, *, ball=(0.0, 0.0), sky=None, pattern=None):
     """Write a capture of ``truth``; a dark room without ``sky``, a ball unless it is None."""
     pattern = blocks() if pattern is None else pattern
     room = None if sky is None else sky(directions(32))
-    sample = render(RIG, truth, pattern, room, GAIN)
+    sample = Fast(make_scene(RIG, pattern, room, GAIN)).render(truth)
 
     def table(point):
         x, y = (point[..., i] / RIG.sample_size + 0.5 for i in (0, 1))

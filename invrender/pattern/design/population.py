@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from invrender.data.environments import procedural_environment
 from invrender.render.backend import Float, UInt, dr, vector
-from invrender.render.renderer import prepare, shade
+from invrender.render.fast.estimator import Fast
 from invrender.render.scene import View, hash_bits, make_scene
 from invrender.rig import Rig
 from invrender.sphere import scale_environment
@@ -146,14 +146,14 @@ def _shade(
     rig: Rig, p: Population, pixels: NDArray[np.intp], pattern: Array, env: Any, samples: int
 ) -> Array:
     """E, B, A and their derivatives, (pixels, 4, 3, RGB)."""
-    prepared = prepare(make_scene(rig, pattern, env))
+    renderer = Fast(make_scene(rig, pattern, env))
     vec3 = vector(Float, 3)
     x = vec3(p.x[pixels].T.astype(np.float32))
     bits = hash_bits(UInt(pixels.astype(np.uint32)), dr.opaque(UInt, 0))
-    view = View(x, dr.normalize(prepared.scene.camera - x), bits)
+    view = View(x, dr.normalize(renderer.scene.camera - x), bits)
     rho = Float(p.roughness[pixels].astype(np.float32))
-    shading = shade(
-        prepared, view, rho, vec3(p.normal[pixels].T.astype(np.float32)), samples, jacobian=True
+    shading = renderer.shade(
+        view, rho, vec3(p.normal[pixels].T.astype(np.float32)), samples, jacobian=True
     )
     rows = [(shading.irradiance, shading.b, shading.a), *shading.tangents]
     dr.eval(rows)

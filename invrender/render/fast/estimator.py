@@ -16,12 +16,29 @@ from invrender.render.fast.irradiance import screen_cell
 from invrender.render.fast.lamps import LAMP_SIDES, MAX_HOT
 from invrender.render.fast.pyramid import disc_direction
 from invrender.render.fast.specular import Sample, reflected, reflected_rows, sample_lobe
-from invrender.render.fast.tables import Tables
+from invrender.render.fast.tables import Tables, fast_tables
+from invrender.render.renderer import Renderer
 from invrender.render.scene import Scene, ScreenFrame, View, screen_frame
 from invrender.render.shading import Shading, Sums, with_tangents
 
 LAMP_SAMPLES = 256  # at least so many where a narrow lobe meets a lamp
 STEEP_SIDE = 16  # screen cells a side where a normal's horizon cuts the screen
+
+
+class Fast(Renderer):
+    """The fast estimator, prepared for a scene: nearly without noise, with a small bias.
+
+    detail: a power of two that multiplies the sizes of its tables; with the samples it takes the
+    bias to zero. Gradients pass through the tables to the lights and the pose.
+    """
+
+    def __init__(self, scene: Scene, detail: int = 1) -> None:
+        self.scene, self.tables = scene, fast_tables(scene, detail)
+
+    def _shade(
+        self, view: View, roughness: Any, normal: Any, samples: int, jacobian: bool
+    ) -> Shading:
+        return shade_fast(self.tables, view, roughness, normal, samples, jacobian)
 
 
 def shade_fast(

@@ -11,7 +11,7 @@ from invrender.maps import constant_maps, resize_maps  # noqa: E402
 from invrender.pattern.default import block_pattern  # noqa: E402
 from invrender.pipeline import Stages, recover, refine_capture, see  # noqa: E402
 from invrender.refine.lobes import fit_lobes  # noqa: E402
-from invrender.render.renderer import material_from_maps, prepare, radiance  # noqa: E402
+from invrender.render import Fast, Material  # noqa: E402
 from invrender.render.scene import make_scene, make_view  # noqa: E402
 from invrender.rig import Rig  # noqa: E402
 from invrender.sampling import resize  # noqa: E402
@@ -28,11 +28,11 @@ torch.set_num_threads(1)
 @pytest.fixture(scope="module")
 def lit():
     """A prepared scene and the photo of a flat sample in it."""
-    prepared = prepare(make_scene(Rig(), block_pattern(64), None, gain=2.0))
+    renderer = Fast(make_scene(Rig(), block_pattern(64), None, gain=2.0))
     maps = constant_maps(SIZE, SIZE, 0.4, 0.04, 0.4)
-    view = make_view(prepared.scene, SIZE, SIZE)
-    color = radiance(prepared, view, material_from_maps(maps), 64)
-    return prepared, np.asarray(color).T.reshape(SIZE, SIZE, 3)
+    view = make_view(renderer.scene, SIZE, SIZE)
+    color = renderer.radiance(view, Material.from_maps(maps), 64)
+    return renderer, np.asarray(color).T.reshape(SIZE, SIZE, 3)
 
 
 def guess(diffuse=0.3, unit=0.7):
@@ -87,11 +87,11 @@ def test_saturated_pixels_say_nothing():
 
 
 def test_a_fresh_correction_changes_next_to_nothing(lit):
-    prepared, photo = lit
+    renderer, photo = lit
     start = guess()
     corrector = Corrector.__new__(Corrector)
     corrector.network = build("correction").eval()
-    after = corrector(photo, prepared, start)
+    after = corrector(photo, renderer, start)
     np.testing.assert_allclose(after.maps.diffuse, start.maps.diffuse, atol=0.02)
     np.testing.assert_allclose(after.maps.normal, start.maps.normal, atol=1e-6)
     np.testing.assert_allclose(after.sigma["roughness"], start.sigma["roughness"], rtol=1e-5)
@@ -99,8 +99,8 @@ def test_a_fresh_correction_changes_next_to_nothing(lit):
 
 def test_the_step_it_sees_points_at_the_truth(lit):
     """A sample darker than it should be: the proposed step brightens the diffuse albedo."""
-    prepared, photo = lit
-    inputs = linearised(photo, prepared, guess(0.3), LOBES, None, 64)
+    renderer, photo = lit
+    inputs = linearised(photo, renderer, guess(0.3), LOBES, None, 64)
     batch = {k: torch.from_numpy(v)[None] for k, v in inputs.items()}
     _, step, _ = gauss_newton(batch)
     assert (step[:, :3] > 0).float().mean() > 0.95
@@ -108,9 +108,9 @@ def test_the_step_it_sees_points_at_the_truth(lit):
 
 
 def test_unit_of_radiance_does_not_matter(lit):
-    prepared, photo = lit
-    brighter = prepare(make_scene(Rig(), block_pattern(64), None, gain=200.0))
-    a = linearised(photo, prepared, guess(unit=0.7), LOBES, None, 64)
+    renderer, photo = lit
+    brighter = Fast(make_scene(Rig(), block_pattern(64), None, gain=200.0))
+    a = linearised(photo, renderer, guess(unit=0.7), LOBES, None, 64)
     b = linearised(100 * photo, brighter, guess(unit=70.0), LOBES, None, 64)
     for k, v in a.items():
         np.testing.assert_allclose(b[k], v, rtol=2e-3, atol=1e-4, err_msg=k)
@@ -133,38 +133,38 @@ def test_nothing_but_numbers_leaves(value):
 
 @pytest.mark.parametrize(("settled", "passes"), [(1.0, 1), (0.0, 3)])
 def test_passes_go_on_until_roughness_settles(lit, monkeypatch, settled, passes):
-    prepared, photo = lit
+    renderer, photo = lit
     monkeypatch.setattr("nets.predict.SETTLED", settled)
     network = restless()
     corrector = Corrector.__new__(Corrector)
     corrector.network = network
-    lobes = fit_lobes(photo, prepared, 64)
+    lobes = fit_lobes(photo, renderer, 64)
     expected = guess()
     for _ in range(passes):
-        expected = corrector._step(photo, prepared, expected, lobes, None, 64)
-    got = corrector(photo, prepared, guess())
+        expected = corrector._step(photo, renderer, expected, lobes, None, 64)
+    got = corrector(photo, renderer, guess())
     np.testing.assert_allclose(got.maps.roughness, expected.maps.roughness, atol=1e-6)
     assert np.abs(got.maps.roughness - guess().maps.roughness).mean() > 1e-3
 
 
 def test_roughness_at_large_is_that_of_the_training_size(lit, monkeypatch):
     """Its large shades are those that a step at `COARSE` finds, its details the step's own."""
-    prepared, photo = lit
+    renderer, photo = lit
     monkeypatch.setattr("nets.predict.PASSES", 1)
     corrector = Corrector.__new__(Corrector)
     corrector.network = restless()
-    own = corrector(photo, prepared, guess()).maps
+    own = corrector(photo, renderer, guess()).maps
     monkeypatch.setattr("nets.predict.COARSE", SIZE // 2)
-    both = corrector(photo, prepared, guess()).maps
+    both = corrector(photo, renderer, guess()).maps
     low = (SIZE // 2, SIZE // 2)
-    lobes = resize_maps(fit_lobes(photo, prepared, 64), *low)
+    lobes = resize_maps(fit_lobes(photo, renderer, 64), *low)
     start = guess()
     start = replace(
         start,
         maps=resize_maps(start.maps, *low),
         sigma={k: resize(v, *low) for k, v in start.sigma.items()},
     )
-    coarse = corrector._step(resize(photo, *low), prepared, start, lobes, None, 64).maps.roughness
+    coarse = corrector._step(resize(photo, *low), renderer, start, lobes, None, 64).maps.roughness
     shades = resize(coarse - resize(own.roughness, *low), SIZE, SIZE)
     np.testing.assert_allclose(both.roughness, own.roughness + shades, atol=1e-5)
     assert np.abs(shades).max() > 1e-3
@@ -181,7 +181,7 @@ def restless():
 
 
 def test_an_interrupted_correction_keeps_the_passes_done(lit, monkeypatch):
-    prepared, photo = lit
+    renderer, photo = lit
     monkeypatch.setattr("nets.predict.SETTLED", 0.0)
     corrector = Corrector.__new__(Corrector)
     network, calls = restless(), []
@@ -193,17 +193,17 @@ def test_an_interrupted_correction_keeps_the_passes_done(lit, monkeypatch):
         return network(batch)
 
     corrector.network = network
-    assert not corrector(photo, prepared, guess()).interrupted
-    once = corrector._step(photo, prepared, guess(), fit_lobes(photo, prepared, 64), None, 64)
+    assert not corrector(photo, renderer, guess()).interrupted
+    once = corrector._step(photo, renderer, guess(), fit_lobes(photo, renderer, 64), None, 64)
     corrector.network = stops
-    best = corrector(photo, prepared, guess())
+    best = corrector(photo, renderer, guess())
     assert best.interrupted
     np.testing.assert_allclose(best.maps.diffuse, once.maps.diffuse, atol=1e-6)
 
 
 def test_of_a_large_photo_the_large_shades_are_corrected(lit, monkeypatch):
     """They are those of the photo shrunk, whose doubts count as well; the details stay."""
-    prepared, photo = lit
+    renderer, photo = lit
     corrector = Corrector.__new__(Corrector)
     corrector.network = restless()
     low = (SIZE // 2, SIZE // 2)
@@ -212,9 +212,9 @@ def test_of_a_large_photo_the_large_shades_are_corrected(lit, monkeypatch):
     small = Estimate(
         resize_maps(start.maps, *low), {k: resize(v, *low) for k, v in start.sigma.items()}, 0.7
     )
-    whole = corrector(resize(photo, *low), prepared, small)
+    whole = corrector(resize(photo, *low), renderer, small)
     monkeypatch.setattr("nets.predict.WHOLE", SIZE // 2)
-    found = corrector(photo, prepared, start)
+    found = corrector(photo, renderer, start)
     for name in ("diffuse", "specular", "roughness"):
         got, old, new = (getattr(e.maps, name) for e in (found, start, whole))
         shades = resize(new - resize(old, *low), SIZE, SIZE)
@@ -226,13 +226,13 @@ def test_of_a_large_photo_the_large_shades_are_corrected(lit, monkeypatch):
 
 def test_no_normal_points_below_the_surface(lit, monkeypatch):
     """Not even steep details on shades that the correction turned the other way."""
-    prepared, photo = lit
+    renderer, photo = lit
     corrector = Corrector.__new__(Corrector)
     corrector.network = restless()
     start = guess()
     start.maps.normal[::2] = [0.9999, 0, 0.0141]
     monkeypatch.setattr("nets.predict.WHOLE", SIZE // 2)
-    normal = corrector(photo, prepared, start).maps.normal
+    normal = corrector(photo, renderer, start).maps.normal
     assert (normal[..., 2] > 0).all()
     np.testing.assert_allclose(np.linalg.norm(normal, axis=-1), 1, atol=1e-5)
 
@@ -266,7 +266,7 @@ def test_an_interrupt_ends_all_photos(monkeypatch):
     seen = see(EXAMPLE, 16, Stages())
     calls = []
 
-    def improve(photo, prepared, estimate, *_):
+    def improve(photo, renderer, estimate, *_):
         calls.append(photo)
         return replace(estimate, interrupted=True)
 
@@ -287,11 +287,11 @@ def test_weights_come_back(tmp_path):
 
 def test_lobes_are_followed_where_trusted(lit):
     """With its doubt taken away, the correction gives the lobes' albedo and roughness."""
-    prepared, photo = lit
+    renderer, photo = lit
     network = build("correction").eval()
     with torch.no_grad():
         network.decoder.ending.bias[13:] = 50
-    batch = linearised(photo, prepared, guess(), LOBES, None, 64)
+    batch = linearised(photo, renderer, guess(), LOBES, None, 64)
     with torch.inference_mode():
         out = network({k: torch.from_numpy(v)[None] for k, v in batch.items()})
     np.testing.assert_allclose(out["roughness"][0, 0].numpy(), LOBES.roughness, atol=1e-5)

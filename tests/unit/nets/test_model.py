@@ -55,11 +55,11 @@ def shaken(network, seed=0):
 
 
 def radiance_of(scene, maps):
-    from invrender.render.renderer import material_from_maps, prepare, radiance
+    from invrender.render import Fast, Material
     from invrender.render.scene import make_view
 
     view = make_view(scene, *maps.shape)
-    return np.asarray(radiance(prepare(scene), view, material_from_maps(maps), 64)).T.reshape(
+    return np.asarray(Fast(scene).radiance(view, Material.from_maps(maps), 64)).T.reshape(
         *maps.shape, 3
     )
 

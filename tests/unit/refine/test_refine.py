@@ -19,7 +19,7 @@ from invrender.refine.lobes import fit_lobes, read_lobes
 from invrender.refine.priors import Prior, lobe_prior, network_prior, pooled
 from invrender.refine.several import find_turn, turned_environment, turned_rig
 from invrender.refine.theta import MIN_ROUGHNESS, to_maps, to_theta
-from invrender.render.renderer import prepare, render
+from invrender.render.fast.estimator import Fast
 from invrender.render.scene import make_scene
 from invrender.rig import Rig
 from invrender.sphere import scale_environment
@@ -34,12 +34,12 @@ def environment():
 
 
 @pytest.fixture(scope="module")
-def prepared(environment):
-    return prepare(make_scene(RIG, PATTERN, environment, GAIN))
+def renderer(environment):
+    return Fast(make_scene(RIG, PATTERN, environment, GAIN))
 
 
 def photo_of(maps, environment, samples=64):
-    return render(RIG, maps, PATTERN, environment, GAIN, samples=samples)
+    return Fast(make_scene(RIG, PATTERN, environment, GAIN)).render(maps, samples)
 
 
 def test_theta_round_trip():
@@ -53,13 +53,13 @@ def test_theta_round_trip():
     assert max(map_errors(back, maps).values()) < 1e-6
 
 
-def test_linearise_predicts_small_changes(prepared):
+def test_linearise_predicts_small_changes(renderer):
     rng = np.random.default_rng(1)
     theta = to_theta(constant_maps(SIZE, SIZE, 0.4, 0.1, 0.5))
     theta += 0.05 * rng.standard_normal(theta.shape).astype(np.float32)
     step = 2e-4 * rng.standard_normal(theta.shape).astype(np.float32)
-    image, jacobian = linearise(prepared, theta, 64)
-    moved, _ = linearise(prepared, theta + step, 64)
+    image, jacobian = linearise(renderer, theta, 64)
+    moved, _ = linearise(renderer, theta + step, 64)
     predicted = np.einsum("hwcp,hwp->hwc", jacobian, step)
     error = np.linalg.norm(moved - image - predicted) / np.linalg.norm(predicted)
     assert error < 0.02
@@ -74,9 +74,9 @@ def test_linearise_predicts_small_changes(prepared):
     ],
     ids=["matt", "glossy", "metal"],
 )
-def test_lobe_of_a_uniform_sample_is_found(prepared, environment, k_d, k_s, rho):
+def test_lobe_of_a_uniform_sample_is_found(renderer, environment, k_d, k_s, rho):
     truth = constant_maps(SIZE, SIZE, k_d, k_s, rho)
-    maps = fit_lobes(photo_of(truth, environment), prepared)
+    maps = fit_lobes(photo_of(truth, environment), renderer)
     error = map_errors(maps, truth)
     assert error["roughness"] < 0.02
     assert error["specular"] < 0.02
@@ -84,7 +84,7 @@ def test_lobe_of_a_uniform_sample_is_found(prepared, environment, k_d, k_s, rho)
 
 
 @pytest.mark.parametrize("metal", [False, True])
-def test_readings_of_dielectric_and_metal(prepared, environment, metal):
+def test_readings_of_dielectric_and_metal(renderer, environment, metal):
     """Of a textured sample: all three odds name its kind, whose readings are the truth."""
     rng = np.random.default_rng(0)
     truth = constant_maps(SIZE, SIZE, 0.3, 0.04, 0.32)
@@ -92,7 +92,7 @@ def test_readings_of_dielectric_and_metal(prepared, environment, metal):
         truth = constant_maps(SIZE, SIZE, 0, (0.9, 0.7, 0.4), 0.32)
     texture = rng.uniform(0.9, 1.1, (SIZE, SIZE, 1)).astype(np.float32)
     truth.diffuse, truth.specular = truth.diffuse * texture, truth.specular * texture**metal
-    lobes = read_lobes(photo_of(truth, environment), prepared)
+    lobes = read_lobes(photo_of(truth, environment), renderer)
     readings = lobes.readings
     assert readings.shape == (SIZE, SIZE, 16) and lobes.costs.shape == (40,)
     assert ((readings[..., 8:11] > 0) == metal).all()
@@ -105,34 +105,34 @@ def test_readings_of_dielectric_and_metal(prepared, environment, metal):
     assert (costs[:, int(metal)].min(-1) == 0).all() and (costs >= 0).all()
 
 
-def test_white_under_lights_told_too_dark_is_no_metal(prepared, environment):
+def test_white_under_lights_told_too_dark_is_no_metal(renderer, environment):
     """No albedo is above one, but lights may be told half as bright as they are."""
     rng = np.random.default_rng(0)
     truth = constant_maps(SIZE, SIZE, 0.85, 0.04, 0.9)
     truth.diffuse *= rng.uniform(0.95, 1.05, (SIZE, SIZE, 1)).astype(np.float32)
-    maps = fit_lobes(2.2 * photo_of(truth, environment), prepared)
+    maps = fit_lobes(2.2 * photo_of(truth, environment), renderer)
     assert maps.specular.max() < 0.1
     assert maps.diffuse.min() > 0.9
 
 
-def test_two_materials_get_two_lobes(prepared, environment):
+def test_two_materials_get_two_lobes(renderer, environment):
     truth = constant_maps(SIZE, SIZE, (0.5, 0.3, 0.1), 0.04, 0.7)
     half = SIZE // 2
     truth.diffuse[:, :half], truth.specular[:, :half] = 0, 0.8
     truth.roughness[:, :half] = 0.32
     photo = photo_of(truth, environment)
-    start, maps = flat_maps(photo, prepared), fit_lobes(photo, prepared)
+    start, maps = flat_maps(photo, renderer), fit_lobes(photo, renderer)
     assert map_errors(maps, truth)["average"] < 0.4 * map_errors(start, truth)["average"]
 
 
-def test_photo_of_the_prior_changes_nothing(prepared, environment):
+def test_photo_of_the_prior_changes_nothing(renderer, environment):
     maps = constant_maps(SIZE, SIZE, 0.3, 0.04, 0.5)
-    result = refine([Shot(photo_of(maps, environment), prepared)], lobe_prior(maps))
+    result = refine([Shot(photo_of(maps, environment), renderer)], lobe_prior(maps))
     assert result.converged
     assert max(map_errors(result.maps, maps).values()) < 1e-3
 
 
-def test_normals_are_recovered_where_all_else_is_known(prepared, environment):
+def test_normals_are_recovered_where_all_else_is_known(renderer, environment):
     truth = constant_maps(SIZE, SIZE, 0.3, 0.3, 0.4)
     y, x = np.mgrid[:SIZE, :SIZE] / SIZE * 2 * np.pi
     # Slight relief: a reflection must not jump from one block of the pattern to the next.
@@ -143,7 +143,7 @@ def test_normals_are_recovered_where_all_else_is_known(prepared, environment):
     sigma = np.full((SIZE, SIZE, 9), 1e-3, np.float32)
     sigma[..., 7:] = 0.3
     prior = Prior(to_theta(start), sigma, np.eye(9, dtype=np.float32))
-    result = refine([Shot(photo, prepared)], prior)
+    result = refine([Shot(photo, renderer)], prior)
     before, after = map_errors(start, truth), map_errors(result.maps, truth)
     assert after["normal"] < 0.7 * before["normal"]
     errors = [h["photo_error"] for h in result.history]
@@ -155,21 +155,21 @@ def test_normals_are_recovered_where_all_else_is_known(prepared, environment):
     assert 0.2 < np.sqrt(np.mean((error / left) ** 2)) < 1.5
 
 
-def test_clipped_pixels_keep_their_prior(prepared, environment):
+def test_clipped_pixels_keep_their_prior(renderer, environment):
     truth = constant_maps(SIZE, SIZE, 0.5, 0.04, 0.5)
     prior = lobe_prior(constant_maps(SIZE, SIZE, 0.2, 0.04, 0.5))
     clipped = np.zeros((SIZE, SIZE), bool)
     clipped[:8] = True
-    result = refine([Shot(photo_of(truth, environment), prepared, clipped)], prior)
+    result = refine([Shot(photo_of(truth, environment), renderer, clipped)], prior)
     np.testing.assert_allclose(result.maps.diffuse[:8], 0.2, atol=1e-3)
     assert result.maps.diffuse[8:].mean() > 0.25
 
 
 @pytest.mark.parametrize("value", [0.0, 1e-6, 1e4])
-def test_any_photo_gives_finite_maps_in_range(prepared, value):
+def test_any_photo_gives_finite_maps_in_range(renderer, value):
     photo = np.full((8, 8, 3), value, np.float32)
-    maps = fit_lobes(photo, prepared)
-    result = refine([Shot(photo, prepared)], lobe_prior(maps), iterations=3)
+    maps = fit_lobes(photo, renderer)
+    result = refine([Shot(photo, renderer)], lobe_prior(maps), iterations=3)
     for image in result.maps.encoded().values():
         assert np.isfinite(image).all() and image.min() >= 0 and image.max() <= 1
     assert (result.maps.diffuse + result.maps.specular).max() <= 1 + 1e-6
@@ -177,13 +177,13 @@ def test_any_photo_gives_finite_maps_in_range(prepared, value):
     assert np.isfinite(result.sigma).all()
 
 
-def test_one_pixel(prepared):
+def test_one_pixel(renderer):
     photo = np.full((1, 1, 3), 0.1, np.float32)
-    result = refine([Shot(photo, prepared)], lobe_prior(fit_lobes(photo, prepared)))
+    result = refine([Shot(photo, renderer)], lobe_prior(fit_lobes(photo, renderer)))
     assert result.maps.shape == (1, 1)
 
 
-def test_correction_of_a_networks_maps(prepared, environment):
+def test_correction_of_a_networks_maps(renderer, environment):
     """Wrong albedos move to the truth, roughness stays, and what is clipped keeps its prior."""
     truth = constant_maps(SIZE, SIZE, 0.4, 0.04, 0.5)
     start = constant_maps(SIZE, SIZE, 0.48, 0.04, 0.5)
@@ -192,7 +192,7 @@ def test_correction_of_a_networks_maps(prepared, environment):
     clipped = np.zeros((SIZE, SIZE), bool)
     clipped[:8] = True
     prior = network_prior(start, sigma)
-    result = correct([Shot(photo_of(truth, environment), prepared, clipped)], prior)
+    result = correct([Shot(photo_of(truth, environment), renderer, clipped)], prior)
     assert map_errors(result.maps, truth)["diffuse"] < 0.7 * map_errors(start, truth)["diffuse"]
     assert np.array_equal(result.maps.roughness, start.roughness)
     assert result.maps.diffuse[:8] == pytest.approx(start.diffuse[:8], abs=1e-5)
@@ -213,18 +213,18 @@ def wrong_by(truth, seed):
     return network_prior(to_maps(theta), sigma)
 
 
-def test_two_photos_tell_more_than_one(prepared, environment):
+def test_two_photos_tell_more_than_one(renderer, environment):
     """The second under another pattern and with the sample turned."""
     truth = procedural_material(5, SIZE, SIZE, kind="leather")
     other = PATTERN[::-1, :, ::-1].copy()
-    photo = render(RIG, turn_maps(truth, 1), other, environment, GAIN)
+    photo = Fast(make_scene(RIG, other, environment, GAIN)).render(turn_maps(truth, 1))
     turned = make_scene(turned_rig(RIG, -1), other, turned_environment(environment, -1), GAIN)
     shots = [
-        Shot(photo_of(truth, environment), prepared),
-        Shot(np.ascontiguousarray(np.rot90(photo, -1)), prepare(turned)),
+        Shot(photo_of(truth, environment), renderer),
+        Shot(np.ascontiguousarray(np.rot90(photo, -1)), Fast(turned)),
     ]
     # The turned photo is what the turned lights make of the sample that lies as before.
-    image, _ = linearise(shots[1].prepared, to_theta(truth), 64)
+    image, _ = linearise(shots[1].renderer, to_theta(truth), 64)
     assert np.abs(image - shots[1].photo).mean() < 0.02 * image.mean()
 
     prior = wrong_by(truth, 0)
@@ -254,9 +254,9 @@ def test_turn_is_found():
     assert find_turn(plain, plain) == 0
 
 
-def test_bands_give_what_the_whole_gives(prepared, environment, monkeypatch):
+def test_bands_give_what_the_whole_gives(renderer, environment, monkeypatch):
     truth = procedural_material(7, SIZE, SIZE)
-    shots, prior = [Shot(photo_of(truth, environment), prepared)], wrong_by(truth, 1)
+    shots, prior = [Shot(photo_of(truth, environment), renderer)], wrong_by(truth, 1)
     whole = refine(shots, prior, iterations=2), correct(shots, prior)
     monkeypatch.setattr(refinement, "BAND", 5 * SIZE)
     parts = refine(shots, prior, iterations=2), correct(shots, prior)
@@ -266,7 +266,7 @@ def test_bands_give_what_the_whole_gives(prepared, environment, monkeypatch):
         assert a.history[0]["photo_error"] == pytest.approx(b.history[0]["photo_error"])
 
 
-def test_interrupt_keeps_the_best_so_far(prepared, environment):
+def test_interrupt_keeps_the_best_so_far(renderer, environment):
     truth = constant_maps(SIZE, SIZE, 0.5, 0.04, 0.5)
     prior = lobe_prior(constant_maps(SIZE, SIZE, 0.45, 0.04, 0.5))
 
@@ -274,22 +274,23 @@ def test_interrupt_keeps_the_best_so_far(prepared, environment):
         if step == 1:
             raise KeyboardInterrupt
 
-    result = refine([Shot(photo_of(truth, environment), prepared)], prior, progress=stop)
+    result = refine([Shot(photo_of(truth, environment), renderer)], prior, progress=stop)
     assert result.interrupted and not result.converged
     error = np.abs(result.maps.diffuse - truth.diffuse).mean()
     assert error < np.abs(prior.mean[..., :3] - truth.diffuse).mean()
 
 
-def test_albedo_that_makes_up_for_wrong_lights_is_told(prepared, environment):
+def test_albedo_that_makes_up_for_wrong_lights_is_told(renderer, environment):
     """A matt sample: the photo is explained in any rig, but the albedo's colours tell."""
     truth = constant_maps(SIZE, SIZE, (0.5, 0.35, 0.2), 0.04, 0.5)
     high = replace(RIG, screen_height=1.2 * RIG.screen_height)
-    photos = photo_of(truth, environment), render(high, truth, PATTERN, environment, GAIN)
-    right, wrong = (baked_light(flat_maps(p, prepared).diffuse, prepared) for p in photos)
+    raised = Fast(make_scene(high, PATTERN, environment, GAIN))
+    photos = photo_of(truth, environment), raised.render(truth)
+    right, wrong = (baked_light(flat_maps(p, renderer).diffuse, renderer) for p in photos)
     assert right < 0.3 and wrong > BAKED
     dark = constant_maps(SIZE, SIZE, 0.0)
-    assert baked_light(dark.diffuse, prepared) == 0
-    plain = prepare(make_scene(RIG, np.ones((4, 4, 3), np.float32), None, 1.0))
+    assert baked_light(dark.diffuse, renderer) == 0
+    plain = Fast(make_scene(RIG, np.ones((4, 4, 3), np.float32), None, 1.0))
     assert baked_light(truth.diffuse, plain) == 0
 
 

@@ -3,12 +3,17 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from forward_scenes import some_environment, some_maps, some_pattern  # noqa: E402
+from forward_scenes import (  # noqa: E402
+    ESTIMATORS,
+    rendered,
+    some_environment,
+    some_maps,
+    some_pattern,
+)
 
-from invrender.render import renderer as render  # noqa: E402
-from invrender.render import torch as torch_interop  # noqa: E402
 from invrender.render.backend import Float, ad  # noqa: E402
 from invrender.render.scene import make_scene, make_view  # noqa: E402
+from invrender.render.torch import Renderer  # noqa: E402
 from invrender.rig import Rig  # noqa: E402
 
 N = 6
@@ -22,18 +27,18 @@ def setup(scalar, estimator="fast"):
         torch.tensor(getattr(maps, k), dtype=dtype)
         for k in ("diffuse", "specular", "roughness", "normal")
     ]
-    return render.prepare(scene, estimator), make_view(scene, N, N), maps, tensors
+    return Renderer(ESTIMATORS[estimator](scene)), make_view(scene, N, N), maps, tensors
 
 
 def test_values_are_the_renderers():
-    prepared, view, maps, tensors = setup(Float)
-    expected = render.render(Rig(), maps, some_pattern(), some_environment(), 2.0, samples=16)
-    color = torch_interop.radiance(prepared, view, *tensors, 16)
+    renderer, view, maps, tensors = setup(Float)
+    expected = rendered(Rig(), maps, some_pattern(), some_environment(), 2.0, samples=16)
+    color = renderer(*tensors, samples=16)
     assert color.shape == (N, N, 3) and not color.requires_grad
     assert np.allclose(color.numpy(), expected, rtol=1e-5)
     flat = [t.reshape(N * N, -1) for t in tensors]
     flat[0].requires_grad_()
-    color = torch_interop.radiance(prepared, view, *flat, 16)
+    color = renderer(*flat, samples=16, view=view)
     assert color.shape == (N * N, 3) and color.requires_grad
     assert np.allclose(color.detach().numpy().reshape(N, N, 3), expected, rtol=1e-5)
 
@@ -41,19 +46,19 @@ def test_values_are_the_renderers():
 @pytest.mark.parametrize("estimator", ["fast", "mis"])
 def test_gradients_match_differences(estimator):
     """Along random directions of all four maps, as torch.autograd.gradcheck's fast mode does."""
-    prepared, view, _, tensors = setup(ad.Float64, estimator)
+    renderer, _, _, tensors = setup(ad.Float64, estimator)
     weights = torch.randn(N, N, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     for k, name in enumerate(("diffuse", "specular", "roughness", "normal")):
         if estimator == "mis" and k > 1:
             continue  # its samples follow the roughness and the normal
         leaves = [t.clone().requires_grad_(i == k) for i, t in enumerate(tensors)]
-        torch.sum(torch_interop.radiance(prepared, view, *leaves, 16) * weights).backward()
+        torch.sum(renderer(*leaves, samples=16) * weights).backward()
         direction = torch.randn_like(tensors[k])
         h = 1e-6
 
         def value(step, k=k, direction=direction, h=h):
             moved = [t + step * h * direction if i == k else t for i, t in enumerate(tensors)]
-            return torch.sum(torch_interop.radiance(prepared, view, *moved, 16) * weights)
+            return torch.sum(renderer(*moved, samples=16) * weights)
 
         difference = (value(1) - value(-1)) / (2 * h)
         found = torch.sum(leaves[k].grad * direction)
@@ -61,6 +66,6 @@ def test_gradients_match_differences(estimator):
 
 
 def test_a_wrong_precision_is_refused():
-    prepared, view, _, tensors = setup(Float)
+    renderer, _, _, tensors = setup(Float)
     with pytest.raises(TypeError, match="float32"):
-        torch_interop.radiance(prepared, view, *(t.double() for t in tensors), 16)
+        renderer(*(t.double() for t in tensors), samples=16)
