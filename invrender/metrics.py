@@ -1,21 +1,18 @@
-"""How far two images, or two sets of maps, are apart: RMSE, PSNR, SSIM, FLIP and LPIPS.
+"""How far two images, or two sets of maps, are apart: RMSE, PSNR, SSIM and FLIP.
 
-RMSE, PSNR and SSIM need nothing beyond the core install. FLIP [Andersson et al. 2020 and 2021] is
-NVIDIA's ``flip-evaluator``, LPIPS [Zhang et al. 2018] is `invrender.lpips`; both are optional, and
-a metric that cannot be computed is None.
+PSNR and SSIM are scikit-image's (kornia's SSIM with valid borders is the same to 1e-10, but torch
+takes twice as long to import). FLIP [Andersson et al. 2020 and 2021] is NVIDIA's
+``flip-evaluator``, which is optional. A metric that cannot be computed is None.
 """
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from PIL import Image
 
 from invrender.colour import linear_to_srgb
-from invrender.lpips import Lpips
 from invrender.maps import Maps, map_errors
 from invrender.rig import Rig
+from invrender.sampling import resize
 from invrender.types import Array, InputError
 
 Metrics = dict[str, float | None]
@@ -25,16 +22,14 @@ _SSIM_WINDOW = 11
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
-def image_metrics(
-    image: Array, reference: Array, *, hdr: bool = False, lpips: Lpips | None = None
-) -> Metrics:
+def image_metrics(image: Array, reference: Array, *, hdr: bool = False) -> Metrics:
     """Metrics of an image (H, W, 3) against a reference of the same shape.
 
     Images are as displayed, in [0, 1]; or, with ``hdr``, linear radiance: then ``rmse`` is of
     radiance, ``relative`` is the RMSE over the reference's mean, FLIP is HDR-FLIP, and the others
     are measured on the sRGB display of both with the reference's 99.5th percentile as white.
-    ``psnr`` (dB) is None for images that agree exactly, ``ssim`` and ``lpips`` for images too small
-    for them. Raises `InputError` for shapes that differ and for values that are not finite.
+    ``psnr`` (dB) is None for images that agree exactly, ``ssim`` for images too small for it.
+    Raises `InputError` for shapes that differ and for values that are not finite.
     """
     image, reference = _checked(image, reference)
     rmse = float(np.sqrt(np.mean((image - reference) ** 2)))
@@ -48,36 +43,36 @@ def image_metrics(
     metrics["psnr"] = psnr(shown, truth)
     metrics["ssim"] = ssim(shown, truth)
     metrics["flip"] = flip(image, reference, hdr=hdr)
-    metrics["lpips"] = lpips(shown, truth) if lpips else None
     return metrics
 
 
-def map_metrics(
-    maps: Maps, truth: Maps, rig: Rig | None = None, *, lpips: Lpips | None = None
-) -> dict[str, Metrics]:
+def map_metrics(maps: Maps, truth: Maps, rig: Rig | None = None) -> dict[str, Metrics]:
     """``maps``: the RMSE of each map and their average; ``rerender``: what relighting shows of it.
 
     Nine point lights on a 3 × 3 grid at the screen's height, seen from the camera, clipped, gamma
-    1/2.2; RMSE over all nine images, the other metrics their mean. Images larger than `RERENDER`
-    pixels a side are averaged down to that.
+    1/2.2; RMSE and PSNR over all nine images, the other metrics their mean. Images larger than
+    `RERENDER` pixels a side are averaged down to that.
     """
     from invrender.render.point_lights import rerender
 
     if maps.shape != truth.shape:
         raise InputError(f"maps of {_size(maps.shape)} and of {_size(truth.shape)} pixels differ")
     images = [_reduce(rerender(m, rig)) for m in (maps, truth)]
-    each = [image_metrics(a, b, lpips=lpips) for a, b in zip(*images, strict=True)]
-    squares = np.mean([float(m["rmse"] or 0) ** 2 for m in each])
-    names = ("ssim", "flip", "lpips")
-    means = {n: _mean([m[n] for m in each]) for n in names}
-    first: Metrics = {**map_errors(maps, truth)}
-    rmse = float(np.sqrt(squares))
-    return {"maps": first, "rerender": {"rmse": rmse, "psnr": _decibels(squares), **means}}
+    each = [image_metrics(a, b) for a, b in zip(*images, strict=True)]
+    means = {n: _mean([m[n] for m in each]) for n in ("ssim", "flip")}
+    rmse = float(np.sqrt(np.mean((images[0].astype(np.float64) - images[1]) ** 2)))
+    rerendered: Metrics = {"rmse": rmse, "psnr": psnr(*images), **means}
+    return {"maps": {**map_errors(maps, truth)}, "rerender": rerendered}
 
 
 def psnr(image: Array, reference: Array) -> float | None:
     """Peak signal-to-noise ratio in dB for a peak of 1; None where there is no difference."""
-    return _decibels(float(np.mean((image.astype(np.float64) - reference) ** 2)))
+    from skimage.metrics import peak_signal_noise_ratio
+
+    if np.array_equal(image, reference):
+        return None
+    image, reference = (np.asarray(x, np.float64) for x in (image, reference))
+    return float(peak_signal_noise_ratio(reference, image, data_range=1))
 
 
 def ssim(image: Array, reference: Array) -> float | None:
@@ -165,10 +160,6 @@ def _size(shape: tuple[int, ...]) -> str:
     return " × ".join(str(n) for n in reversed(shape[:2]))
 
 
-def _decibels(squares: float | np.floating[Any]) -> float | None:
-    return float(-10 * np.log10(squares)) if squares > 0 else None
-
-
 def _mean(values: list[float | None]) -> float | None:
     known = [v for v in values if v is not None]
     return float(np.mean(known)) if known and len(known) == len(values) else None
@@ -180,9 +171,5 @@ def _reduce(images: Array) -> Array:
     if max(height, width) <= RERENDER:
         return images
     scale = RERENDER / max(height, width)
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    box = Image.Resampling.BOX
-    planes = [
-        [np.asarray(Image.fromarray(i[..., c]).resize(size, box)) for c in range(3)] for i in images
-    ]
-    return np.moveaxis(np.array(planes), 1, -1)
+    size = max(1, round(height * scale)), max(1, round(width * scale))
+    return np.array([resize(image, *size) for image in images])

@@ -18,7 +18,7 @@ def add_parser(commands: Any) -> None:
         "compare",
         help="measure how far a result, maps or an image are from a reference",
         description="Compare two folders of maps (results of refine, or captures with ground "
-        "truth) or two images of one size: RMSE, PSNR, SSIM, FLIP and LPIPS. Of maps, the metrics "
+        "truth) or two images of one size: RMSE, PSNR, SSIM and FLIP. Of maps, the metrics "
         "are of the maps and of nine images relit by point lights.",
     )
     parser.add_argument("a", type=Path, metavar="A", help="folder or image")
@@ -29,7 +29,6 @@ def add_parser(commands: Any) -> None:
 
 def run(args: argparse.Namespace, console: Console) -> int:
     """Run the sub-command."""
-    from invrender.lpips import Lpips
     from invrender.metrics import FLIP_MISSING, map_metrics
 
     for path in (args.a, args.b):
@@ -38,16 +37,11 @@ def run(args: argparse.Namespace, console: Console) -> int:
     if args.a.is_dir() != args.b.is_dir():
         raise InputError("compare two folders of maps, or two images, not one of each")
     notes: list[str] = []
-    lpips = None
-    try:
-        lpips = Lpips()
-    except InputError as missing:
-        notes.append(str(missing))
     if args.a.is_dir():
         (maps, rig_a), (truth, rig_b) = (_maps(path) for path in (args.a, args.b))
-        table = map_metrics(maps, truth, rig_b or rig_a, lpips=lpips)
+        table = map_metrics(maps, truth, rig_b or rig_a)
     else:
-        table = {"image": _images(args.a, args.b, lpips)}
+        table = {"image": _images(args.a, args.b)}
     if all(group.get("flip") is None for group in table.values()):
         notes.append(FLIP_MISSING)
     if args.json:
@@ -75,11 +69,11 @@ def _maps(folder: Path) -> tuple[Any, Any]:
     return capture.truth, capture.rig
 
 
-def _images(a: Path, b: Path, lpips: Any) -> dict[str, float | None]:
+def _images(a: Path, b: Path) -> dict[str, float | None]:
     """Metrics of two files: linear radiance if either is an EXR, else as displayed."""
     from invrender.files.images import read_image
     from invrender.metrics import image_metrics
 
     hdr = any(path.suffix.lower() == ".exr" for path in (a, b))
     # Display values are compared as they are stored.
-    return image_metrics(*(read_image(p, linear=not hdr) for p in (a, b)), hdr=hdr, lpips=lpips)
+    return image_metrics(*(read_image(p, linear=not hdr) for p in (a, b)), hdr=hdr)

