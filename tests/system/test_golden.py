@@ -1,11 +1,11 @@
 """The maps of four runs, pinned: a change that moves any of them must do so on purpose.
 
-``python tests/system/test_golden.py --write`` makes ``golden/maps.npz`` anew, after a change that is
-meant to move them, and prints how far each moved; commit it together with that change.
+``python tests/system/test_golden.py --write`` makes ``golden/maps.npz`` anew, after a change that
+is meant to move them, and prints how far each moved; commit it together with that change.
 
 On one machine the maps are the same to 1e-6. Between processors vector instructions round
-differently: with those of AVX-512 forbidden to numpy, OpenBLAS and torch, the worst pixel of the four
-runs moves by 2.4e-4 and no map by more than 2e-6 on average.
+differently: with those of AVX-512 forbidden to numpy, OpenBLAS and torch, the worst pixel of the
+four runs moves by 2.4e-4 and no map by more than 2e-6 on average.
 """
 
 import shutil
