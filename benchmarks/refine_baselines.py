@@ -257,6 +257,7 @@ def adapt(problem: Problem, rate: float, seconds: float, limit: int) -> tuple[fl
     inputs = light_inputs(
         lights.rig, lights.pattern, lights.gain, lights.environment, lights.pattern_captured
     )
+    assert problem.estimate.lobes is not None  # a fresh estimate's
     batch = batch_of(problem.photo, inputs, problem.estimate.lobes)
     network = copy.deepcopy(problem.network.network).requires_grad_()
     optimiser = torch.optim.Adam(network.parameters(), rate)

@@ -22,8 +22,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from nets.batch import Batch
 from nets.blocks import Decoder, Encoder, blocks, pad_to
-from nets.model import MAX_SIGMA, MIN_SIGMA, Batch, Config, encode, slope_normal
+from nets.model import MAX_SIGMA, MIN_SIGMA, Config, encode, slope_normal
 
 NOISE = (0.04, 0.01)  # of the photo: relative to the pixel, and to a white plane
 ALBEDO_CORRELATION = (0.9, 0.95)  # between the colours of k_d's error, and of k_s's

@@ -6,7 +6,8 @@ pass) → clue encoder; both bottlenecks → fusion → material decoder. A batc
     photo (B, 3, H, W) radiance; position (B, 2, H, W) in [-1, 1]², x right, y up; and the light as
     `nets.clues.light_inputs` gives it, each with a batch axis: env_clues, active_clues,
     slope_clues, sky, screen, ball, pattern, rig; and with ``lobes`` lobes (B, 7, H, W), albedos and
-    roughness as `invrender.refine.lobes` finds them, readings (B, 16, H, W) and costs (B, 40).
+    roughness as `invrender.refine.lobes` finds them, and what the photo says of dielectric and of
+    metal, evidence (B, 16, H, W) and costs (B, 40), see `nets.batch.pack_evidence`.
 
 All of it may be in any unit of radiance: it is divided by that of a white plane first.
 """
@@ -20,11 +21,17 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from invrender.types import InputError
+from nets.batch import (
+    COST_COUNT,
+    EVIDENCE,
+    EVIDENCE_CHANNELS,
+    Batch,
+    split_channels,
+    unpack_evidence,
+)
 from nets.blocks import Decoder, Encoder, Pointwise, blocks, pad_to
 from nets.slopes import SLOPE_FEATURES, slope_features
 from nets.splitsum import brdf_table, hit_screen, normal_clues, reflect, sample, view_directions
-
-Batch = dict[str, Tensor]
 
 ALBEDO = 0.6
 BASIS = ((0.2, 0.0), (0.2, 0.6), (0.6, 0.0), (0.6, 0.6))
@@ -32,9 +39,11 @@ CLUES = ("none", "mirrorball", "plane", "colored", "full")
 MAPS = ("normal", "diffuse", "roughness", "specular")
 LIGHTS = ("env_clues", "active_clues", "slope_clues", "sky", "screen", "ball", "pattern")
 MIN_SIGMA, MAX_SIGMA = 0.002, 1.0
-# What `invrender.refine.lobes` tells of a photo, and its usual f0; training needs no more of it.
-READINGS, COSTS, USUAL_F0 = 16, 40, 0.04
-MIXED = 6  # weights of what the photo says of a dielectric and of metal, for three maps
+DIELECTRIC_F0 = 0.04  # of common plastics, stone and paint: an index of refraction of 1.5
+# What the material decoder puts out, and how many channels each.
+OUTPUTS = {"slope": 2, "diffuse": 3, "roughness": 1, "specular": 3, "log_sigma": 4}
+# Logits of the dielectric's and the metal's weights beside the network's own map.
+WEIGHTS = {"diffuse_weights": 2, "roughness_weights": 2, "specular_weights": 2}
 
 
 @dataclass(frozen=True)
@@ -123,18 +132,17 @@ class Network(nn.Module):
             if config.clue_skips and clue
             else None
         )
-        self.costs = nn.Sequential(nn.Linear(COSTS, 64), nn.GELU(), nn.Linear(64, deep)) if (
+        self.costs = nn.Sequential(nn.Linear(COST_COUNT, 64), nn.GELU(), nn.Linear(64, deep)) if (
             config.lobes
         ) else None  # fmt: skip
-        self.material_decoder = Decoder(
-            2 + 7 + 4 + (MIXED if config.lobes else 0), width, config.decoder
-        )
+        self.outputs = OUTPUTS | (WEIGHTS if config.lobes else {})
+        self.material_decoder = Decoder(sum(self.outputs.values()), width, config.decoder)
         # A fresh network predicts a plane of middling materials, in doubt.
         with torch.no_grad():
             self.material_decoder.ending.weight *= 0.1
             self.normal_decoder.ending.weight *= 0.1
             start = [0, 0, *[0.3] * 3, 0.5, *[0.1] * 3, -3, -1.5, -1.5, -2]
-            start += [-1] * (MIXED if config.lobes else 0)
+            start += [-1] * (sum(WEIGHTS.values()) if config.lobes else 0)
             for decoder, values in ((self.normal_decoder, [0, 0]), (self.material_decoder, start)):
                 assert decoder.ending.bias is not None
                 decoder.ending.bias.copy_(torch.tensor(values))
@@ -174,7 +182,7 @@ class Network(nn.Module):
             )
         if self.config.lobes:
             inputs.append(2 * pad_to(batch["lobes"], self.multiple) - 0.5)
-            inputs.append(_scaled(pad_to(batch["readings"], self.multiple)))
+            inputs.append(_scaled(pad_to(batch["evidence"], self.multiple)))
 
         x, skips = self.encoder(_last(torch.cat(inputs, 1)))
         slope0 = self.normal_decoder(x, skips)
@@ -191,27 +199,28 @@ class Network(nn.Module):
         if self.costs is not None:
             x = x + self.costs(batch["costs"])[..., None, None]
         y = self.material_decoder(x, skips)
-        y, normal0 = y[..., :height, :width], normal0[..., :height, :width]
-        slope = slope0[..., :height, :width] + y[:, :2]
-        diffuse, roughness, specular = y[:, 2:5], y[:, 5:6], y[:, 6:9]
+        normal0 = normal0[..., :height, :width]
+        y = split_channels(y[..., :height, :width], self.outputs)
+        slope = slope0[..., :height, :width] + y["slope"]
+        diffuse, roughness, specular = y["diffuse"], y["roughness"], y["specular"]
         if self.config.lobes:
-            readings = batch["readings"]
-            nought = torch.zeros_like(diffuse)
-            cases = [
-                (diffuse, readings[:, :3], nought),
-                (roughness, readings[:, 3:4], readings[:, 7:8]),
-                (specular, nought + USUAL_F0, readings[:, 13:16]),
-            ]
-            diffuse, roughness, specular = (
-                _mean(own, dielectric, metal, logits)
-                for (own, dielectric, metal), logits in zip(
-                    cases, y[:, 13:].split(2, 1), strict=True
-                )
+            evidence = unpack_evidence(batch)
+            black = torch.zeros_like(diffuse)
+            diffuse = _mean(diffuse, evidence.dielectric_diffuse, black, y["diffuse_weights"])
+            roughness = _mean(
+                roughness,
+                evidence.dielectric_roughness,
+                evidence.metal_roughness,
+                y["roughness_weights"],
             )
+            specular = _mean(
+                specular, black + DIELECTRIC_F0, evidence.metal_material_specular,
+                y["specular_weights"],
+            )  # fmt: skip
         if not self.training:
             diffuse, specular = diffuse.clamp(0, 1), specular.clamp(0, 1)
             roughness = roughness.clamp(0.02, 1)
-        sigma = torch.exp(y[:, 9:13].clamp(-6.2, 0)) * self.calibration[:, None, None]
+        sigma = torch.exp(y["log_sigma"].clamp(-6.2, 0)) * self.calibration[:, None, None]
         out |= {"normal0": normal0, "normal": slope_normal(slope), "diffuse": diffuse}
         out |= {"roughness": roughness, "specular": specular}
         out["sigma"] = sigma.clamp(MIN_SIGMA, MAX_SIGMA)
@@ -236,10 +245,10 @@ class Network(nn.Module):
         return torch.cat(clues, 1)
 
 
-def _scaled(readings: Tensor) -> Tensor:
-    """Readings as inputs: shares to [-0.5, 1.5], odds halved."""
-    odds = torch.arange(readings.shape[1], device=readings.device).sub(9).abs() < 2
-    return torch.where(odds[:, None, None], readings / 2, 2 * readings - 0.5)
+def _scaled(evidence: Tensor) -> Tensor:
+    """Evidence as inputs: albedos and roughness to [-0.5, 1.5], odds halved."""
+    parts = split_channels(evidence, EVIDENCE)
+    return torch.cat([x / 2 if "odds" in k else 2 * x - 0.5 for k, x in parts.items()], 1)
 
 
 def _mean(own: Tensor, dielectric: Tensor, metal: Tensor, logits: Tensor) -> Tensor:
@@ -255,7 +264,7 @@ def _knows_environment(config: Config) -> bool:
 def _channels(config: Config) -> tuple[int, int]:
     """Input channels of the image encoder and of the clue encoder."""
     image = 8 + (12 if config.active else 0) + (SLOPE_FEATURES if config.slopes else 0)
-    image += 7 + READINGS if config.lobes else 0
+    image += 7 + EVIDENCE_CHANNELS if config.lobes else 0
     lit = 6 if config.active else 0
     clue = {
         "none": 0, "mirrorball": 3, "plane": 12, "full": 16 + lit, "colored": 24 + lit,

@@ -26,9 +26,9 @@ from invrender.render.scene import make_scene
 from invrender.rig import Rig
 from invrender.sampling import resize
 from invrender.types import Array, InputError
-from nets.batch import PIXELS, batch_of, lobe_input, positions
+from nets.batch import PIXELS, Batch, batch_of, lobe_input, positions
 from nets.clues import light_inputs, white_level
-from nets.model import MAPS, Batch
+from nets.model import MAPS
 from nets.store import load_weights
 
 WEIGHTS = Path(__file__).with_name("weights")
@@ -45,8 +45,8 @@ class Estimate:
 
     Those of normals are of the encoded map, n/2 + 1/2; where the photo says nothing they are large.
     unit: the radiance of a white plane under the capture's lights. lobes: what
-    `invrender.refine.lobes` found of the photo, at most `WHOLE` pixels a side, if the network
-    asked for it. interrupted: by Ctrl-C, before all passes of the correction were done.
+    `invrender.refine.lobes` found of the photo, at most `WHOLE` pixels a side. interrupted: by
+    Ctrl-C, before all passes of the correction were done.
     """
 
     maps: Maps
@@ -96,10 +96,8 @@ class Reconstructor:
         report(0.3)
 
         def maps_of(photo: Array, progress: Callable[[float], None] | None = None) -> Estimate:
-            lobes = None
-            if self.network.config.lobes:
-                seen = np.clip(np.nan_to_num(photo * scale, posinf=0.0, neginf=0.0), 0, 1e3)
-                lobes = read_lobes(seen, renderer)
+            seen = np.clip(np.nan_to_num(photo * scale, posinf=0.0, neginf=0.0), 0, 1e3)
+            lobes = read_lobes(seen, renderer)
             kept = keep and _kept(keep, self.notes, photo, *lights.values())
             out = predict(self.network, batch_of(photo, lights, lobes), progress, kept)
             return replace(estimate_of(out, unit), lobes=lobes)

@@ -6,8 +6,8 @@ colour, so many pixels together tell the lobe that one cannot: the roughness tha
 of a list, and its k_s by least squares. First for the sample as a whole, then for each group of
 pixels of like albedo. Relief widens the lobe that is found.
 
-Whether a material is bare metal is often a close call: for the networks `read_lobes` tells what the
-photo says of either case, and the odds.
+Whether a material is bare metal is often a close call: `read_lobes` also gives what the photo says
+of either case (`invrender.refine.evidence`), which the networks weigh.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from scipy.ndimage import uniform_filter
 
 from invrender.colour import AXES
 from invrender.maps import Maps
+from invrender.refine.evidence import MaterialEvidence, compress
 from invrender.refine.flat import USUAL_ROUGHNESS, USUAL_SPECULAR, diffuse_rest, plane_terms
 from invrender.render.renderer import Renderer
 from invrender.sampling import resize
@@ -75,18 +76,10 @@ class Lobe:
 @dataclass(frozen=True)
 class Lobes:
     """What a fit finds of a sample: ``maps``, those of each group's likeliest lobe; and, whichever
-    case is likelier, ``readings`` (H, W, 16) and ``costs`` (40,).
-
-    readings: 0 to 3, k_d and ρ of a usual dielectric; 4 to 7, k_s pixel by pixel and ρ of bare
-    metal; 8 to 10, how much likelier metal is (`_squashed`) by the residuals of the group, by those
-    of the sample, by its texture (`_plainness`); 11 and 12, ρ of either case by the texture, the
-    posterior mean; 13 to 15, the group's k_s as metal. costs: -2 log-likelihood of each of
-    `ROUGHNESS` over the least, squashed: by residuals, dielectric and metal, and by texture.
-    """
+    case is likelier, what the photo says of dielectric and of metal."""
 
     maps: Maps
-    readings: Array
-    costs: Array
+    evidence: MaterialEvidence
 
 
 def lobe_terms(renderer: Renderer, height: int, width: int, samples: int = 64) -> list[list[Array]]:
@@ -120,9 +113,7 @@ def read_lobes(
     full = _full_terms(photo, renderer, samples, terms, every)
     maps, label = _maps(photo, lobes, full)
     sample, texture = _either(moments, np.ones(small.shape[:2], bool)), _by_texture(small, terms)
-    costs = np.stack([c - c.min() for c in (sample.costs, texture)])
-    readings = _readings(photo, full, label, either, sample, texture)
-    return Lobes(maps, readings, _squashed(costs).ravel().astype(np.float32))
+    return Lobes(maps, _evidence(photo, full, label, either, sample, texture))
 
 
 def _small(photo: Array) -> Array:
@@ -175,28 +166,31 @@ def _maps(photo: Array, lobes: list[Lobe], terms: dict[int, list[Array]]) -> tup
     return maps, label
 
 
-def _readings(
+def _evidence(
     photo: Array, terms: dict[int, list[Array]], label: Labels, either: list[_Either],
     sample: _Either, texture: Array,
-) -> Array:  # fmt: skip
-    """`Lobes.readings`: labels, and the ``sample``, as ``either`` case; costs by ``texture``."""
+) -> MaterialEvidence:  # fmt: skip
+    """Of a photo whose pixels belong to the groups ``label``, each with its two fits ``either``;
+    the ``sample`` fitted as one material; costs by ``texture``."""
     dielectric, metal = zip(*(e.lobes for e in either), strict=True)
     weight = np.exp((texture.min(1, keepdims=True) - texture) / 2)
-    odds = _squashed(np.array([sample.odds, texture[0].min() - texture[1].min()]))
-    out = np.empty((*label.shape, 16), np.float32)
-    out[..., :3] = _select(label, [f.diffuse(photo, terms[f.rho]) for f in dielectric])
-    out[..., 3] = ROUGHNESS[[f.rho for f in dielectric]][label]
-    out[..., 4:7] = _select(label, [f.mirror(photo, terms[f.rho]) for f in metal])
-    out[..., 7] = ROUGHNESS[[f.rho for f in metal]][label]
-    out[..., 8] = _squashed(np.array([e.odds for e in either]))[label]
-    out[..., 9:11], out[..., 11:13] = odds, weight @ ROUGHNESS / weight.sum(1)
-    out[..., 13:] = np.array([f.f0 for f in metal])[label]
-    return out
-
-
-def _squashed(odds: Array) -> Array:
-    """Odds without their extremes: arsinh of a tenth."""
-    return np.arcsinh(odds / 10)
+    mean_roughness = weight @ ROUGHNESS / weight.sum(1)
+    everywhere = lambda x: np.broadcast_to(np.float32(x), label.shape)  # noqa: E731
+    by_group = lambda x: np.asarray(x, np.float32)[label]  # noqa: E731
+    return MaterialEvidence(
+        dielectric_diffuse=_select(label, [f.diffuse(photo, terms[f.rho]) for f in dielectric]),
+        dielectric_roughness=by_group(ROUGHNESS[[f.rho for f in dielectric]]),
+        metal_specular=_select(label, [f.mirror(photo, terms[f.rho]) for f in metal]),
+        metal_roughness=by_group(ROUGHNESS[[f.rho for f in metal]]),
+        material_odds=by_group(compress(np.array([e.odds for e in either]))),
+        sample_odds=everywhere(compress(np.asarray(sample.odds))),
+        texture_odds=everywhere(compress(texture[0].min() - texture[1].min())),
+        dielectric_texture_roughness=everywhere(mean_roughness[0]),
+        metal_texture_roughness=everywhere(mean_roughness[1]),
+        metal_material_specular=by_group([f.f0 for f in metal]),
+        residual_costs=np.float32(compress(sample.costs - sample.costs.min())),
+        texture_costs=np.float32(compress(texture - texture.min())),
+    )
 
 
 def _terms(renderer: Renderer, height: int, width: int, rho: float, samples: int) -> list[Array]:

@@ -13,8 +13,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from invrender.types import InputError
-from nets.batch import PIXELS, positions
-from nets.model import Batch
+from nets.batch import PIXELS, Batch, positions
 
 GROUP = 8  # shards that are shuffled together
 CPU = torch.device("cpu")
@@ -43,6 +42,9 @@ def _load(paths: Sequence[Path], device: torch.device) -> Batch:
     """The captures of some shards, one after another. A GPU keeps every shard that it has seen."""
     load = _keep if device.type == "cuda" else load_file
     parts = [load(path, str(device)) for path in paths]
+    for part in parts:
+        if "readings" in part:  # the evidence's name in shards of version 0.1
+            part["evidence"] = part.pop("readings")
     return {k: torch.cat([part[k] for part in parts]) for k in parts[0]}
 
 

@@ -7,7 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from nets.model import MAPS, Batch, Config, encode, normalise
+from nets.batch import Batch
+from nets.model import MAPS, Config, encode, normalise
 
 # Spread of each map over the training data: the error of a constant guess. Errors are measured in
 # it, so that normals (small) and roughness (smooth) weigh as much as albedos from the start.

@@ -27,7 +27,8 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
-from nets.model import CLUES, MAPS, Batch
+from nets.batch import Batch
+from nets.model import CLUES, MAPS
 from nets.store import PRESETS, AnyNetwork, build, load_weights, save_weights
 from nets.training.loader import batches, read_batch, shards
 from nets.training.loss import SPREAD, compare, total_loss

@@ -8,20 +8,28 @@ torch = pytest.importorskip("torch")
 from invrender.data.environments import procedural_environment  # noqa: E402
 from invrender.maps import constant_maps  # noqa: E402
 from invrender.pattern.default import block_pattern  # noqa: E402
+from invrender.refine.evidence import MaterialEvidence  # noqa: E402
 from invrender.render.scene import make_scene  # noqa: E402
 from invrender.rig import Rig  # noqa: E402
 from invrender.sphere import scale_environment  # noqa: E402
 from invrender.types import InputError  # noqa: E402
 from nets import clues, slopes, splitsum  # noqa: E402
-from nets.batch import positions  # noqa: E402
+from nets.batch import (  # noqa: E402
+    COST_COUNT,
+    EVIDENCE,
+    EVIDENCE_CHANNELS,
+    pack_evidence,
+    positions,
+    unpack_evidence,
+)
 from nets.blocks import NAFBlock, pad_to  # noqa: E402
-from nets.model import CLUES, COSTS, READINGS, USUAL_F0, normalise  # noqa: E402
+from nets.model import CLUES, DIELECTRIC_F0, normalise  # noqa: E402
 from nets.predict import Reconstructor, _tiles, predict  # noqa: E402
 from nets.store import build, load_weights, save_weights  # noqa: E402
 from nets.training.train import take_up  # noqa: E402
 
 RIG = Rig()
-UNITLESS = ("position", "rig", "lobes", "readings", "costs")
+UNITLESS = ("position", "rig", "lobes", "evidence", "costs")
 torch.set_num_threads(1)  # small tensors: more only get in each other's way
 
 
@@ -37,10 +45,10 @@ def make_batch(lights, height, width, count=1, seed=0):
     photo = rng.random((count, 3, height, width), np.float32) * 0.3
     batch["photo"] = torch.from_numpy(photo)
     batch["position"] = positions(height, width)[None].repeat(count, 1, 1, 1)
-    for key, channels in (("lobes", 7), ("readings", READINGS)):
+    for key, channels in (("lobes", 7), ("evidence", EVIDENCE_CHANNELS)):
         images = rng.random((count, channels, height, width), np.float32)
         batch[key] = torch.from_numpy(images)
-    batch["costs"] = torch.from_numpy(rng.random((count, COSTS), np.float32))
+    batch["costs"] = torch.from_numpy(rng.random((count, COST_COUNT), np.float32))
     return batch
 
 
@@ -341,13 +349,15 @@ def test_a_network_grows_by_inputs_that_begin_at_nought(lights):
     batch = make_batch(lights, 8, 8)
     torch.testing.assert_close(grown(batch)["sigma"], known(batch)["sigma"])
     weight = grown.encoder.intro.weight
-    assert not weight[:, -7 - READINGS :].any() and weight[:, : -7 - READINGS].all()
+    assert (
+        not weight[:, -7 - EVIDENCE_CHANNELS :].any() and weight[:, : -7 - EVIDENCE_CHANNELS].all()
+    )
     off = grown(batch)["specular"] - known(batch)["specular"]
     assert 0 < off.abs().max() < 0.04
 
 
 @pytest.mark.parametrize("metal", [False, True])
-def test_material_maps_are_the_photos_readings_where_trusted(lights, metal):
+def test_material_maps_are_the_photos_evidence_where_trusted(lights, metal):
     """With all weight on one case, the maps are those of the dielectric, or of bare metal."""
     network = shaken(build("tiny"))
     ending = network.material_decoder.ending
@@ -355,12 +365,30 @@ def test_material_maps_are_the_photos_readings_where_trusted(lights, metal):
         ending.weight[13:] = 0
         ending.bias[13:] = torch.tensor([-40.0, 40.0] if metal else [40.0, -40.0]).repeat(3)
     batch = make_batch(lights, 8, 8)
-    out, readings = network(batch), batch["readings"]
-    nought = torch.zeros(1, 3, 8, 8)
-    torch.testing.assert_close(out["diffuse"], nought if metal else readings[:, :3])
-    torch.testing.assert_close(out["specular"], readings[:, 13:] if metal else nought + USUAL_F0)
-    rough = readings[:, 7:8] if metal else readings[:, 3:4]
+    out, evidence = network(batch), unpack_evidence(batch)
+    black = torch.zeros(1, 3, 8, 8)
+    specular = evidence.metal_material_specular if metal else black + DIELECTRIC_F0
+    rough = evidence.metal_roughness if metal else evidence.dielectric_roughness
+    torch.testing.assert_close(out["diffuse"], black if metal else evidence.dielectric_diffuse)
+    torch.testing.assert_close(out["specular"], specular)
     torch.testing.assert_close(out["roughness"], rough.clamp(min=0.02))
+
+
+def test_evidence_is_packed_and_unpacked():
+    """Every field comes back, in a place of its own; the model's weights depend on the order."""
+    rng = np.random.default_rng(0)
+    images = {k: rng.random((4, 5, n) if n > 1 else (4, 5)) for k, n in EVIDENCE.items()}
+    costs = {k: rng.random((2, 10)) for k in ("residual_costs", "texture_costs")}
+    packed = pack_evidence(MaterialEvidence(**images, **costs))
+    assert packed["evidence"].shape == (16, 4, 5) and packed["costs"].shape == (40,)
+    np.testing.assert_allclose(packed["evidence"][4:7], images["metal_specular"].transpose(2, 0, 1))
+    np.testing.assert_allclose(packed["evidence"][9], images["sample_odds"], rtol=1e-6)
+    again = unpack_evidence({k: torch.from_numpy(v)[None] for k, v in packed.items()})
+    for k, v in images.items():
+        got = getattr(again, k)[0].permute(1, 2, 0).numpy()
+        np.testing.assert_allclose(got, np.atleast_3d(v), rtol=1e-6, err_msg=k)
+    for k, v in costs.items():
+        np.testing.assert_allclose(getattr(again, k)[0], v, rtol=1e-6)
 
 
 @pytest.mark.parametrize("content", [b"", b"nothing of the kind", None])

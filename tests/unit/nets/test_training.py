@@ -16,11 +16,7 @@ from invrender.pattern.default import block_pattern  # noqa: E402
 from invrender.tasks import map_tasks  # noqa: E402
 from invrender.types import InputError  # noqa: E402
 from nets.batch import positions  # noqa: E402
-from nets.model import (  # noqa: E402
-    COSTS,
-    MAPS,
-    READINGS,
-)
+from nets.model import MAPS  # noqa: E402
 from nets.store import build, load_weights  # noqa: E402
 from nets.training import dataset as data  # noqa: E402
 from nets.training import draw, sheet, train  # noqa: E402
@@ -55,7 +51,7 @@ def test_a_shard_holds_captures_in_units_of_white(folder):
         shard["lobes"].shape == (6, 7, 16, 16)
         and 0 <= shard["lobes"].min() <= shard["lobes"].max() <= 1
     )
-    assert shard["readings"].shape == (6, READINGS, 16, 16) and shard["costs"].shape == (6, COSTS)
+    assert shard["evidence"].shape == (6, 16, 16, 16) and shard["costs"].shape == (6, 40)
     assert 0.01 < shard["photo"].astype(float).mean() < 1
 
 

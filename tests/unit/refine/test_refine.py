@@ -84,8 +84,8 @@ def test_lobe_of_a_uniform_sample_is_found(renderer, environment, k_d, k_s, rho)
 
 
 @pytest.mark.parametrize("metal", [False, True])
-def test_readings_of_dielectric_and_metal(renderer, environment, metal):
-    """Of a textured sample: all three odds name its kind, whose readings are the truth."""
+def test_evidence_of_dielectric_and_metal(renderer, environment, metal):
+    """Of a textured sample: all three odds name its kind, whose fit is the truth."""
     rng = np.random.default_rng(0)
     truth = constant_maps(SIZE, SIZE, 0.3, 0.04, 0.32)
     if metal:
@@ -93,15 +93,19 @@ def test_readings_of_dielectric_and_metal(renderer, environment, metal):
     texture = rng.uniform(0.9, 1.1, (SIZE, SIZE, 1)).astype(np.float32)
     truth.diffuse, truth.specular = truth.diffuse * texture, truth.specular * texture**metal
     lobes = read_lobes(photo_of(truth, environment), renderer)
-    readings = lobes.readings
-    assert readings.shape == (SIZE, SIZE, 16) and lobes.costs.shape == (40,)
-    assert ((readings[..., 8:11] > 0) == metal).all()
-    color, rho = (readings[..., 4:7], 7) if metal else (readings[..., :3], 3)
-    wanted = truth.specular if metal else truth.diffuse
+    e = lobes.evidence
+    odds = np.stack([e.material_odds, e.sample_odds, e.texture_odds])
+    assert odds.shape == (3, SIZE, SIZE) and ((odds > 0) == metal).all()
+    if metal:
+        color, wanted, rho = e.metal_specular, truth.specular, e.metal_roughness
+        textured = e.metal_texture_roughness
+        assert np.abs(e.metal_material_specular - truth.specular).mean() < 0.05
+    else:
+        color, wanted, rho = e.dielectric_diffuse, truth.diffuse, e.dielectric_roughness
+        textured = e.dielectric_texture_roughness
     assert np.abs(color - wanted).mean() < 0.02
-    assert np.abs(readings[..., [rho, 12 if metal else 11]] - 0.32).max() < 0.08
-    assert np.abs(readings[..., 13:] - truth.specular).mean() < 0.05 or not metal
-    costs = lobes.costs.reshape(2, 2, -1)
+    assert np.abs(rho - 0.32).max() < 0.08 and np.abs(textured - 0.32).max() < 0.08
+    costs = np.stack([e.residual_costs, e.texture_costs])
     assert (costs[:, int(metal)].min(-1) == 0).all() and (costs >= 0).all()
 
 
