@@ -1,7 +1,7 @@
 """Error of the initial maps against the time they take, for the networks' presets.
 
 Seconds of one sample of 256 × 256 pixels, lights and clues included, median of several; each
-network's error on folders of `nets.training.dataset` (see docs/networks.md), without them and with
+network's error on folders of `nets.training.dataset` (docs/guide/training.md), without and with
 --quick on a few small procedural captures. Presets without weights are timed alone.
 """
 

@@ -1,7 +1,7 @@
 """Ablations of the network at equal steps: validation error against training time.
 
 Every variant sees the same captures in the same order, from the same seed. ``--data`` and
-``--valid`` are folders of `nets.training.dataset` (see docs/networks.md); without them, and with
+``--valid`` are folders of `nets.training.dataset` (docs/guide/training.md); without, and with
 --quick, a few procedural captures are made first. Training goes on where an earlier run stopped.
 """
 

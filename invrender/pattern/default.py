@@ -1,6 +1,6 @@
 """The light pattern that the screen shows.
 
-The default is the outcome of `python -m invrender.pattern.design`: docs/pattern.md tells how.
+The default is the outcome of `python -m invrender.pattern.design` (docs/explain/pattern.md).
 """
 
 from __future__ import annotations

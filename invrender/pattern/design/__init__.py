@@ -1,4 +1,4 @@
-"""Designing the light pattern: docs/pattern.md."""
+"""Designing the light pattern: docs/explain/pattern.md."""
 
 from invrender.pattern.design.criterion import NAMES, WEIGHTS, Criterion
 from invrender.pattern.design.optimise import DARKEST, Design, design, optimise, wheel
