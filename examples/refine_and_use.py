@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from invrender.cli.main import EXAMPLE
+from invrender.data import EXAMPLE
 from invrender.export import export
 from invrender.files.images import read_image
 from invrender.files.maps import read_maps

@@ -5,15 +5,14 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-
-from invrender.types import InputError
+if TYPE_CHECKING:
+    from rich.console import Console
 
 
 def add_parser(commands: Any) -> None:
-    """Add the sub-command to argparse's sub-parsers."""
+    """Add the subcommand to argparse's subparsers."""
     parser = commands.add_parser(
         "compare",
         help="measure how far a result, maps or an image are from a reference",
@@ -28,8 +27,9 @@ def add_parser(commands: Any) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    """Run the sub-command."""
+    """Run the subcommand."""
     from invrender.metrics import FLIP_MISSING, map_metrics
+    from invrender.types import InputError
 
     for path in (args.a, args.b):
         if not path.exists():
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
         for name, value in group.items():
             print(f"  {name:>9}  {'-' if value is None else format(value, '.4f')}")
     for note in notes:
-        console.print(f"  {note}", markup=False, highlight=False)
+        console.print(f"  {note}")
     return 0
 
 
@@ -60,6 +60,7 @@ def _maps(folder: Path) -> tuple[Any, Any]:
     """(Maps, its rig or None) of a folder of maps, or of a capture with ground truth."""
     from invrender.files.capture import load_capture
     from invrender.files.maps import read_maps
+    from invrender.types import InputError
 
     if not (folder / "rig.toml").is_file():
         return read_maps(folder), None

@@ -8,10 +8,10 @@ import json
 import os
 import platform
 import time
-from importlib.metadata import PackageNotFoundError, version
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
+if TYPE_CHECKING:
+    from rich.console import Console
 
 # What each optional module is for, and the extra that brings it.
 OPTIONAL = {
@@ -25,7 +25,7 @@ REQUIRED = ("invrender", "drjit", "mitsuba", "numpy", "scipy", "scikit-image", "
 
 
 def add_parser(commands: Any) -> None:
-    """Add the sub-command to argparse's sub-parsers."""
+    """Add the subcommand to argparse's subparsers."""
     parser = commands.add_parser(
         "doctor",
         help="check the installation",
@@ -38,7 +38,7 @@ def add_parser(commands: Any) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    """Run the sub-command."""
+    """Run the subcommand."""
     with console.status("checking …"):
         found = examine()
     if args.json:
@@ -80,6 +80,8 @@ def examine() -> dict[str, Any]:
 
 
 def _version(name: str) -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
     try:
         return version(name)
     except PackageNotFoundError:

@@ -8,16 +8,16 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from invrender.export import Exported
 
 TARGETS = ("gltf", "materialx", "blender", "unreal", "unity", "mitsuba")
 
 
 def add_parser(commands: Any) -> None:
-    """Add the sub-command to argparse's sub-parsers."""
+    """Add the subcommand to argparse's subparsers."""
     parser = commands.add_parser(
         "export",
         help="write a result for glTF, MaterialX, Blender, Unreal, Unity or Mitsuba",
@@ -56,7 +56,7 @@ def add_parser(commands: Any) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    """Run the sub-command."""
+    """Run the subcommand."""
     from invrender.export import export
 
     with console.status(f"exporting to {args.to} …"):
@@ -101,4 +101,4 @@ def _print(done: Exported, console: Console) -> None:
             f"{done.height['outliers']:.1%} of the slopes"
         )
     for line in lines:
-        console.print(line, markup=False, highlight=False)
+        console.print(line)

@@ -16,6 +16,7 @@ from invrender.capture.crop import crop_mask, sample_corners
 from invrender.capture.lights import Lights, extract_lights, light_warnings
 from invrender.capture.mirror import Ball, horizon_points, mirror_normals, outline_points
 from invrender.capture.orientation import find_upright_ball
+from invrender.cli import arguments
 from invrender.colour import linear_to_srgb
 from invrender.files.capture import Capture, check_photo, load_capture
 from invrender.files.images import Photo, read_photo
@@ -31,8 +32,8 @@ BLURRED = 0.03  # of the ball's radius, the camera's blur from which it is told
 WEAK = 0.1  # share of the sample's light that the pattern gives, likewise; designed for 0.2 or more
 
 
-def add_parser(commands: Any, ball: Any) -> None:
-    """Add the sub-command to argparse's sub-parsers; ``ball`` parses X,Y,R."""
+def add_parser(commands: Any) -> None:
+    """Add the subcommand to argparse's subparsers."""
     parser = commands.add_parser(
         "inspect",
         help="show what is found in a photo: ball, screen, sample, lights",
@@ -42,14 +43,17 @@ def add_parser(commands: Any, ball: Any) -> None:
     parser.add_argument("capture", type=Path, help="a capture's folder, or a photo alone")
     parser.add_argument("-o", "--out", type=Path, help="folder for inspect.png and the lights")
     parser.add_argument(
-        "--ball", type=ball, metavar="X,Y,R", help="the ball's centre and radius in photo pixels"
+        "--ball",
+        type=arguments.ball,
+        metavar="X,Y,R",
+        help="the ball's centre and radius in photo pixels",
     )
     parser.add_argument("--json", action="store_true", help="print the numbers as JSON")
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    """Run the sub-command."""
+    """Run the subcommand."""
     if args.out is not None and args.out.exists() and not args.out.is_dir():
         raise InputError(f"{args.out} is a file; choose a folder for the results")
     if args.capture.is_dir():
@@ -88,9 +92,9 @@ def run(args: argparse.Namespace, console: Console) -> int:
         f"room    {numbers['coverage']:.0%} of the sky seen, {numbers['room_saturated']:.1%} of it "
         f"saturated; the pattern gives {numbers['pattern_share']:.0%} of the light on the sample",
     ):
-        console.print(line, highlight=False, soft_wrap=True)
+        console.print(line)
     for warning in numbers["warnings"]:
-        console.print(f"warning: {warning}", markup=False, highlight=False, soft_wrap=True)
+        console.print(f"warning: {warning}")
     return 0
 
 

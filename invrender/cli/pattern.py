@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-from rich.progress import Progress
-
-from invrender.types import InputError
+if TYPE_CHECKING:
+    from rich.console import Console
 
 
 def add_parser(commands: Any) -> None:
-    """Add the sub-command to argparse's sub-parsers."""
+    """Add the subcommand to argparse's subparsers."""
     parser = commands.add_parser(
         "pattern",
         help="write the light pattern for a display, the capture guide, or optimise a pattern",
@@ -43,7 +41,9 @@ def add_parser(commands: Any) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    """Run the sub-command."""
+    """Run the subcommand."""
+    from rich.progress import Progress
+
     from invrender.files.rig_toml import read_rig
     from invrender.files.write import atomic_path, write_exr, write_png
     from invrender.pattern.default import default_pattern, mirrored
@@ -51,6 +51,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     from invrender.pattern.guide import write_guide
     from invrender.rig import Rig
     from invrender.sampling import resize_pattern
+    from invrender.types import InputError
 
     suffix = args.out.suffix.lower()
     if suffix not in (".png", ".exr", ".html", ".pdf"):
@@ -77,7 +78,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
         if args.optimise or args.mirrored:
             raise InputError("the guide has no pattern: leave out --optimise and --mirrored")
         write_guide(args.out, rig)
-        console.print(f"wrote {args.out}", highlight=False)
+        console.print(f"wrote {args.out}")
         return 0
     if args.optimise:
         import numpy as np
@@ -97,8 +98,6 @@ def run(args: argparse.Namespace, console: Console) -> int:
             parts = ", ".join(f"{m} {errors[m]:.4f}" for m in NAMES)
             console.print(
                 f"  {name:>9}: expected error {parts}; criterion {errors['criterion']:.3f}",
-                highlight=False,
-                soft_wrap=True,
             )
         pattern = found.pattern
     else:
@@ -113,5 +112,5 @@ def run(args: argparse.Namespace, console: Console) -> int:
         image = resize_pattern(pattern, size)
         image = mirrored(image) if args.mirrored else image
         (write_png if suffix == ".png" else write_exr)(args.out, image)
-    console.print(f"wrote {args.out}", highlight=False)
+    console.print(f"wrote {args.out}")
     return 0

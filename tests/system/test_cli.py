@@ -8,7 +8,8 @@ import sys
 import numpy as np
 import pytest
 
-from invrender.cli.main import EXAMPLE, main
+from invrender.cli.main import main
+from invrender.data import EXAMPLE
 from invrender.files.images import read_image
 from invrender.files.maps import read_maps
 from invrender.files.write import write_exr
@@ -54,23 +55,6 @@ def test_report_tells_what_was_gained(result):
     errors = report["map_error"]
     assert errors["refined"]["average"] < 0.8 * errors["initial"]["average"]
     assert {"ball", "lights", "refine", "render"} <= report["seconds"].keys()
-
-
-def test_without_torch(tmp_path):
-    """``--init flat`` needs no network library."""
-    code = (
-        "import sys\n"
-        "class Block:\n"
-        "    def find_spec(self, name, path=None, target=None):\n"
-        "        if name.split('.')[0] in ('torch', 'kornia', 'nets'):\n"
-        "            raise ImportError(name)\n"
-        "sys.meta_path.insert(0, Block())\n"
-        "from invrender.cli import main\n"
-        f"sys.exit(main(['refine', 'example', '-o', {str(tmp_path / 'out')!r}, '--size', '16',"
-        " '--init', 'flat']))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
 
 
 def test_module_is_a_command(tmp_path):

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from invrender.cli.main import EXAMPLE
+from invrender.data import EXAMPLE
 from invrender.files.capture import load_capture
 from invrender.types import InputError
 

@@ -8,7 +8,8 @@ import pytest
 
 from invrender import metrics
 from invrender.cli import compare as compare_cli
-from invrender.cli.main import EXAMPLE, main
+from invrender.cli.main import main
+from invrender.data import EXAMPLE
 from invrender.files.maps import read_maps, write_maps
 from invrender.files.write import write_exr, write_png
 from invrender.maps import constant_maps

@@ -6,7 +6,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from invrender.cli.main import EXAMPLE  # noqa: E402
+from invrender.data import EXAMPLE  # noqa: E402
 from invrender.maps import constant_maps, resize_maps  # noqa: E402
 from invrender.pattern.default import block_pattern  # noqa: E402
 from invrender.pipeline import Stages, recover, refine_capture, see  # noqa: E402

@@ -1,0 +1,65 @@
+"""``invrender simulate``: a synthetic capture with its ground truth."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+def add_parser(commands: Any) -> None:
+    """Add the subcommand to argparse's subparsers."""
+    parser = commands.add_parser(
+        "simulate",
+        help="render a synthetic capture with its ground truth",
+        description="Path-trace a whole photograph (sample, mirror ball, table) of a material "
+        "under the pattern, and write it as a capture folder.",
+    )
+    parser.add_argument("-o", "--out", type=Path, required=True, help="new folder to write")
+    parser.add_argument("--maps", type=Path, help="folder with a material's maps")
+    parser.add_argument("--kind", help="procedural material instead, e.g. bricks or rust")
+    parser.add_argument("--environment", type=Path, help="equirectangular EXR or HDR file")
+    parser.add_argument("--pattern", type=Path, help="pattern image (the default one)")
+    parser.add_argument("--irradiance", type=float, default=0.5, help="of the room (0.5)")
+    parser.add_argument("--gain", type=float, default=2.0, help="radiance of white (2)")
+    parser.add_argument("--size", type=int, default=256, help="pixels a side of the maps (256)")
+    parser.add_argument("--width", type=int, default=1280, help="of the photo, pixels (1280)")
+    parser.add_argument("--spp", type=int, default=64, help="path tracer's samples (64)")
+    parser.add_argument("--noise", type=float, default=0.005, help="of the sensor (0.005)")
+    parser.add_argument("--seed", type=int, default=0, help="of everything random (0)")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace, console: Console) -> int:
+    from invrender.data.environments import procedural_environment, read_environment
+    from invrender.data.materials import procedural_material, read_material
+    from invrender.data.simulate import simulate
+    from invrender.files.images import read_image
+    from invrender.maps import resize_maps
+    from invrender.pattern.default import default_pattern
+    from invrender.rig import Rig
+    from invrender.sphere import scale_environment
+    from invrender.types import InputError
+
+    if args.size < 1 or args.width < 64 or args.spp < 1:
+        raise InputError("sizes and sample counts must be positive, the photo 64 pixels or wider")
+    if args.maps:
+        maps = resize_maps(read_material(args.maps), args.size, args.size)
+    else:
+        maps = procedural_material(args.seed, args.size, args.size, kind=args.kind)
+    if args.environment:
+        environment = read_environment(args.environment, 256)
+    else:
+        environment = procedural_environment(args.seed, 256)
+    environment = scale_environment(environment, args.irradiance)
+    pattern = read_image(args.pattern) if args.pattern else default_pattern()
+    with console.status("path tracing …"):
+        simulate(
+            args.out, maps, environment, pattern, Rig(),
+            gain=args.gain, width=args.width, spp=args.spp, noise=args.noise, seed=args.seed,
+        )  # fmt: skip
+    console.print(f"wrote {args.out}")
+    return 0
