@@ -16,6 +16,7 @@ import contextlib
 import math
 import statistics
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +27,9 @@ from scipy.spatial.transform import Rotation
 from benchmarks.common.photos import Shot, arguments, make_shot
 from benchmarks.common.results import bar, table, write_results
 from invrender.capture.ball import find_ball
-from invrender.capture.camera import corners
-from invrender.capture.lights import extract_lights
+from invrender.capture.camera import corners, find_camera
+from invrender.capture.lights import find_lights, measure_lights
 from invrender.capture.mirror import make_ball
-from invrender.capture.orientation import find_upright_ball, posed
 from invrender.capture.table import room_irradiance
 from invrender.files.capture import Capture
 from invrender.rig import Rig
@@ -59,20 +59,21 @@ def measure(shot: Shot, kind: str) -> dict[str, Any]:
     capture = Capture(shot.photo, shot.nominal, shot.pattern)
     start = time.process_time()
     try:
-        capture, tilt = posed(capture)
+        rig, tilt = find_camera(capture.photo, capture.rig)
+        capture = replace(capture, rig=rig)
         true = corners(shot.photo, shot.rig)
         side = np.linalg.norm(true[1] - true[0])
         for name, rig in (("sample told", shot.nominal), ("sample", capture.rig)):
             off = np.linalg.norm(corners(shot.photo, rig) - true, axis=-1)
             row[name] = float(off.mean() / side)
-        ball = find_ball(capture.photo, capture.rig, tilt=tilt)
+        ball = find_ball(capture.photo, capture.rig, tilt_deviation=tilt)
         row["s"] = time.process_time() - start
         row["confidence"] = ball.confidence
         if shot.ball is not None:
             truth = make_ball(shot.rig, shot.ball, shot.rig.ball_radius, ball.size)
             row["centre"] = float(np.hypot(*np.subtract(ball.centre, truth.centre)) / truth.radius)
             row["radius"] = abs(ball.radius / truth.radius - 1)
-        lights = extract_lights(capture, ball)
+        lights = measure_lights(capture, ball)
         if shot.ball is None:
             return row
     except InputError as error:
@@ -113,11 +114,11 @@ def screen_pose(rig: Rig, ball: Any) -> tuple[Any, Rotation]:
 
 
 def big_photo() -> float:
-    """Processor seconds to find the ball in 12 megapixels."""
+    """Processor seconds to find the lights in 12 megapixels."""
     shot = make_shot(SEED - 1, width=4000)
     start = time.process_time()
     with contextlib.suppress(InputError):
-        find_upright_ball(Capture(shot.photo, shot.nominal, shot.pattern))
+        find_lights(Capture(shot.photo, shot.nominal, shot.pattern))
     return time.process_time() - start
 
 

@@ -20,6 +20,7 @@ from scipy import ndimage
 from benchmarks.common.captures import HOLDOUT
 from benchmarks.common.photos import Shot, arguments, make_shot
 from benchmarks.common.results import table, write_results
+from invrender.capture.ball_image import trace_image
 from invrender.capture.clipped_lamps import clipped_share, raise_clipped
 from invrender.capture.environment import fill_environment, unfold_environment
 from invrender.capture.mirror import make_ball
@@ -63,15 +64,16 @@ def measure(shot: Shot) -> dict[str, Any] | None:
     """Relative error of the irradiance by each method; None where no lamp is clipped."""
     photo, rig = shot.photo, shot.rig
     assert shot.ball is not None and photo.clip_level is not None
-    ball = make_ball(rig, shot.ball, rig.ball_radius, (photo.height, photo.width))
-    environment, coverage = unfold_environment(photo, rig, ball)
-    share = clipped_share(photo, rig, ball, len(environment))
+    size = (photo.height, photo.width)
+    image = trace_image(rig, make_ball(rig, shot.ball, rig.ball_radius, size))
+    environment, coverage = unfold_environment(photo, rig, image)
+    share = clipped_share(photo, rig, image, len(environment))
     if (share.max(-1) > 0).mean() < LIT / 2:
         return None
     level = photo.clip_level / np.asarray(rig.ball_reflectance)
     x = environment / level
     raised, factor = raise_clipped(
-        photo, rig, ball, shot.shown, shot.gain, environment, coverage
+        photo, rig, image, shot.shown, shot.gain, environment, coverage
     )  # fmt: skip
     results: list[Array] = [
         environment, environment + share * level,

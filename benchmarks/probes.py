@@ -19,8 +19,7 @@ import numpy as np
 
 from benchmarks.common.results import bar, benchmark_parser, table, write_results
 from invrender.capture.ball import find_ball
-from invrender.capture.lights import extract_lights
-from invrender.capture.orientation import find_upright_ball
+from invrender.capture.lights import find_lights
 from invrender.files.capture import MIN_PHOTO, Capture
 from invrender.files.images import Photo, read_photo
 from invrender.pattern.default import default_pattern
@@ -54,8 +53,7 @@ def measure(photo: Photo, rig: Rig) -> dict[str, Any]:
     row: dict[str, Any] = {"accepted": False}
     try:
         row["confidence"] = find_ball(photo, rig).confidence
-        capture, ball, _ = find_upright_ball(Capture(photo, rig, default_pattern()))
-        extract_lights(capture, ball)
+        find_lights(Capture(photo, rig, default_pattern()))
         row["accepted"] = True
     except InputError as error:
         row["refused"] = str(error)

@@ -6,25 +6,23 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from invrender.capture.crop import crop_mask, crop_sample
-from invrender.capture.lights import Lights, extract_lights, light_warnings
+from invrender.capture.lights import Lights, find_lights
 from invrender.capture.mirror import Ball
-from invrender.capture.orientation import find_upright_ball, posed
 from invrender.files.capture import Capture, load_capture
 from invrender.maps import Maps, map_errors, resize_maps, turn_maps
 from invrender.refine.checks import coarse_error, photo_error
 from invrender.report.page import Report
 from invrender.report.results import write_results
-from invrender.types import Array, InputError
+from invrender.types import Array, InputError, Notice
 
 if TYPE_CHECKING:
     from invrender.refine.gauss_newton import Refined
@@ -42,7 +40,7 @@ class Seen:
     """What a capture tells before its maps: the lights, and the sample as its photo shows it.
 
     photo: (size, size, 3), linear radiance; clipped: (size, size), where it is saturated. ball:
-    None where the lights were known without one. turned: what was turned upright, a sentence each.
+    None where the lights were known without one. notices: what a person should know of them.
     """
 
     capture: Capture
@@ -50,7 +48,7 @@ class Seen:
     lights: Lights
     photo: Array
     clipped: NDArray[np.bool_]
-    turned: Sequence[str] = ()
+    notices: Sequence[Notice] = ()
 
     def renderer(self, turn: int = 0) -> Any:
         """The forward model of these lights, turned by quarters about the sample's normal."""
@@ -96,38 +94,12 @@ def see(
     """
     with stage("read"):
         capture = load_capture(folder)
-    found = None
-    turned: list[str] = []
-    if environment is not None and gain is not None:
-        with stage("crop"):
-            capture, _ = posed(capture)
-        lights = known_lights(capture, environment, gain)
-    else:
-        # The matrices are small: more threads than one only get in each other's way.
-        with threadpool_limits(1, "blas"):
-            with stage("ball"):
-                capture, found, turned = find_upright_ball(capture, ball)
-            with stage("lights"):
-                lights = extract_lights(capture, found)
-        if environment is not None:
-            lights = replace(lights, environment=environment)
-        if gain is not None:
-            lights = replace(lights, gain=_rgb(gain))
+    with stage("lights"):
+        found = find_lights(capture, ball=ball, environment=environment, gain=gain)
     with stage("crop"):
-        photo = crop_sample(capture.photo, lights.rig, size)
-        clipped = crop_mask(capture.photo, lights.rig, size)
-    return Seen(capture, found, lights, photo, clipped, turned)
-
-
-def _rgb(gain: Any) -> Array:
-    return np.broadcast_to(np.asarray(gain, np.float32), 3).copy()
-
-
-def known_lights(capture: Capture, environment: Array, gain: Any) -> Lights:
-    """Lights that a person states: the pattern is taken to be shown as it should be."""
-    covered = np.ones(environment.shape[:2], np.float32)
-    shown = (capture.pattern * _rgb(gain)).astype(np.float32)
-    return Lights(environment, covered, capture.pattern, _rgb(gain), shown, capture.rig)
+        photo = crop_sample(found.capture.photo, found.lights.rig, size)
+        clipped = crop_mask(found.capture.photo, found.lights.rig, size)
+    return Seen(found.capture, found.ball, found.lights, photo, clipped, found.notices)
 
 
 def recover(
@@ -310,7 +282,7 @@ def _networks() -> tuple[Any, Any]:
 
 
 def _warnings(seen: Seen, error: float, result: Refined, init: str, baked: float) -> list[str]:
-    warnings = [*seen.turned, *light_warnings(seen.lights)]
+    warnings = [notice.text for notice in seen.notices]
     clipped, fit = seen.clipped, seen.lights.fit
     if fit.get("screen_shift", 0) > FAR_OFF * seen.lights.rig.screen_size:
         warnings.append(

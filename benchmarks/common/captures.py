@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from benchmarks.common.results import benchmark_parser
-from invrender.capture.lights import Lights
+from invrender.capture.lights import Lights, known_lights
 from invrender.colour import linear_to_srgb
 from invrender.data.environments import find_environments, procedural_environment, read_environment
 from invrender.data.materials import find_materials, procedural_material, read_material
@@ -30,7 +30,6 @@ from invrender.files.rig_toml import read_rig
 from invrender.files.write import write_exr
 from invrender.maps import Maps, crop_maps, resize_maps, turn_maps
 from invrender.pattern.default import default_pattern
-from invrender.pipeline import known_lights
 from invrender.rig import Rig
 from invrender.sphere import rotate_environment, scale_environment
 

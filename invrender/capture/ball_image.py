@@ -3,20 +3,61 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
 
 from invrender.capture.mirror import Ball, mirror_normals
+from invrender.capture.settings import UNFOLDING
 from invrender.files.images import Photo
 from invrender.rig import Rig
 from invrender.types import Array, Mask
 
-# Pixels around the screen's image that may hold some of its light, and how many more for each of
-# the camera's blur: the screen is often a hundred times as bright as the room beside it.
-SCREEN_MARGIN = 1.5
-# A veil over the ball is told from the table that is mirrored from 1.8 radii on.
-BARE = 1.8
+
+@dataclass(frozen=True)
+class BallImage:
+    """The window of a photo that holds the ball, and what each of its pixels sees.
+
+    rows, columns: the window in the photo; pixels (h, w, 2): positions of the pixels' centres;
+    point, mirrored (h, w, 3): where the ray meets the ball, and the unit direction into which it is
+    mirrored; visible (h, w): whether it meets the ball at all, the rest is undefined. Made once for
+    a photo by `trace_image`; only the camera and the ball matter to it, not the screen.
+    """
+
+    ball: Ball
+    rows: slice
+    columns: slice
+    pixels: Array
+    point: Array
+    mirrored: Array
+    visible: Mask
+
+    @property
+    def area(self) -> tuple[slice, slice]:
+        """The window, to index the photo with."""
+        return self.rows, self.columns
+
+    @property
+    def origin(self) -> tuple[int, int]:
+        """Row and column of the window's first pixel."""
+        return self.rows.start, self.columns.start
+
+    @property
+    def sky(self) -> Mask:
+        """(h, w): pixels that see what is above the horizon."""
+        return self.visible & (self.mirrored[..., 2] > 0)
+
+    def screen(self, rig: Rig) -> Mask:
+        """(h, w): pixels that see the screen."""
+        return self.visible & screen_coordinates(rig, self.point, self.mirrored)[2]
+
+
+def trace_image(rig: Rig, ball: Ball) -> BallImage:
+    """The ball's image with the rays of its pixels' centres."""
+    rows, columns = window(ball)
+    pixels = pixel_grid(rows, columns)
+    return BallImage(ball, rows, columns, pixels, *trace_ball(rig, ball, pixels))
 
 
 def screen_coordinates(rig: Rig, origin: Array, direction: Array) -> tuple[Array, Array, Mask]:
@@ -35,7 +76,7 @@ def screen_coordinates(rig: Rig, origin: Array, direction: Array) -> tuple[Array
 def trace_ball(rig: Rig, ball: Ball, pixels: Array) -> tuple[Array, Array, Mask]:
     """Points on the ball and mirrored unit directions, both (..., 3), for photo pixels (..., 2).
 
-    The mask says which pixels see the hemisphere at all; the rest is undefined.
+    The mask says which pixels see the ball at all; the rest is undefined.
     """
     ray = rig.rays(pixels, *ball.size)
     centre = np.asarray(ball.position)
@@ -49,9 +90,9 @@ def trace_ball(rig: Rig, ball: Ball, pixels: Array) -> tuple[Array, Array, Mask]
     return point, mirrored, (discriminant > 0) & (point[..., 2] >= 0)
 
 
-def window(ball: Ball, margin: float = 4.0) -> tuple[slice, slice]:
+def window(ball: Ball) -> tuple[slice, slice]:
     """Rows and columns of the photo that hold the ball."""
-    (x, y), r = ball.centre, max(ball.ellipse[2:4]) + margin
+    (x, y), r = ball.centre, max(ball.ellipse[2:4]) + UNFOLDING.window_margin
     h, w = ball.size
     return (
         slice(max(0, math.floor(y - r)), min(h, math.ceil(y + r))),
@@ -59,10 +100,10 @@ def window(ball: Ball, margin: float = 4.0) -> tuple[slice, slice]:
     )
 
 
-def pixel_grid(rows: slice, columns: slice, samples: int = 1) -> Array:
-    """Positions (H·samples, W·samples, 2) evenly within the pixels of a window."""
-    y = rows.start + (np.arange((rows.stop - rows.start) * samples) + 0.5) / samples
-    x = columns.start + (np.arange((columns.stop - columns.start) * samples) + 0.5) / samples
+def pixel_grid(rows: slice, columns: slice) -> Array:
+    """Positions (H, W, 2) of the centres of a window's pixels."""
+    y = rows.start + np.arange(rows.stop - rows.start) + 0.5
+    x = columns.start + np.arange(columns.stop - columns.start) + 0.5
     return np.stack(np.broadcast_arrays(x[None, :], y[:, None]), -1)
 
 
@@ -77,29 +118,25 @@ def sample_image(image: Array, pixels: Array, origin: tuple[int, int] = (0, 0)) 
     return np.stack(out, -1) if image.ndim == 3 else out[0]
 
 
-def screen_mask(rig: Rig, ball: Ball, margin: float) -> tuple[Array, tuple[slice, slice]]:
-    """1 where the ball's image shows the screen, grown by ``margin`` pixels; and its window."""
-    rows, columns = area = window(ball)
-    point, mirrored, seen = trace_ball(rig, ball, pixel_grid(rows, columns))
-    _, _, hit = screen_coordinates(rig, point, mirrored)
-    distance = ndimage.distance_transform_edt(~(hit & seen))
+def screen_mask(rig: Rig, image: BallImage, margin: float) -> Array:
+    """(h, w): 1 where the ball's image shows the screen, grown by ``margin`` pixels."""
+    distance = ndimage.distance_transform_edt(~image.screen(rig))
     # The edge of the mask's pixels lies half a pixel outside their centres.
-    return np.asarray(distance <= margin + 0.5, np.float32), area
+    return np.asarray(distance <= margin + 0.5, np.float32)
 
 
-def unfold_pattern(photo: Photo, rig: Rig, ball: Ball, size: int = 256, samples: int = 1) -> Array:
+def unfold_pattern(photo: Photo, rig: Rig, ball: Ball, size: int = 256) -> Array:
     """The screen as the ball shows it, (size, size, 3) radiance, row 0 at +y, column 0 at -x.
 
-    For each point of the screen the point of the ball that mirrors it into the camera, near field.
+    For each point of the screen the photo is looked up at the point of the ball that mirrors it
+    into the camera; the screen counts as near.
     """
     rows, columns = window(ball)
-    n = size * samples
-    s = (np.arange(n) + 0.5) / n
+    s = (np.arange(size) + 0.5) / size
     e_x, e_y = rig.screen_edges
     target = rig.screen_corner + s[None, :, None] * e_x + (1 - s)[:, None, None] * e_y
     centre = np.asarray(ball.position)
     normal = mirror_normals(rig, centre, ball.radius_m, target, True)
     pixels = rig.project(centre + ball.radius_m * normal, *ball.size)
     light = sample_image(photo.image[rows, columns], pixels, (rows.start, columns.start))
-    light = light.reshape(size, samples, size, samples, 3).mean((1, 3))
-    return (light / np.asarray(rig.ball_reflectance)).astype(np.float32)
+    return np.asarray(light / np.asarray(rig.ball_reflectance), np.float32)

@@ -5,11 +5,11 @@ whole way of its rays: the photo shows it as one line, what the ball mirrors sta
 cuts the table in a line through the centre. On each such line the table outside the ball and its
 image inside are one unknown function of the distance from the centre. Near the ball it is solved
 for by linear least squares, at every step anew (variable projection: Golub and Pereyra 1973, with
-Kaufman's derivative, 1975); farther out the photo shows it. The ball is where the rest is least:
-at its outline the radiance drops by the mirror's reflectance, and inside it runs backwards.
+Kaufman's derivative, 1975); farther out the photo shows it. The ball is where the residuals are
+least: at its outline the radiance drops by the mirror's reflectance, and inside it runs backwards.
 
 The camera's tilt moves the horizon's image by a hundredth of the radius a degree and the outline
-not at all, so that the two together tell it.
+not at all, so that the two together determine it.
 """
 
 from __future__ import annotations
@@ -24,66 +24,52 @@ from scipy import ndimage
 
 from invrender.capture.ball_image import sample_image
 from invrender.capture.ball_view import View, edges, horizon_curve, normals, outline_curve
+from invrender.capture.robust import spread as robust_spread
+from invrender.capture.settings import LUMINANCE, RIM_FIT, TINY
 from invrender.rig import Rig
 from invrender.types import Array, Mask
 
-FINE = 3  # points of a line to each of the view's pixels
-SPACING = 0.014  # of the unknown table's nodes, in radii
-ROUGH = 0.03  # usual second difference from one to the next, of the radiance's median
-NEAREST, FARTHEST = 0.80, 3.0  # radii where the lines begin, and to which the table is looked up
-# Lines, blur in the view's pixels, radii to which the table is unknown, steps, radii to start from.
-STAGES = (
-    (48, 2.0, 1.08, 4, (0.95, 0.975, 1.0, 1.025, 1.05)),
-    (64, 1.0, 1.15, 6, (1.0,)),
-    (144, 0.0, 1.25, 10, (1.0,)),
-)
-LIKELIEST = 2  # of a stage's starts, where the fit is not thorough
-LUMA = (0.2126, 0.7152, 0.0722)  # a JPEG has its colours at half the resolution
 # The unknowns: x, y, radius in metres; the camera's tilt in degrees about x and y; the logarithms
 # of its blur in the view's pixels and of the mirror's reflectance over the rig's.
 _TILT, _BLUR, _MIRROR = slice(3, 5), 5, 6
-TILT_PRIOR, BLUR_PRIOR, MIRROR_PRIOR = 1.5, 0.15, 0.01
-USUAL_BLUR = 0.8
-OUT = 4.0  # spreads
-ROBUST = 1.25  # spreads from which a residual counts less
-GUESS = 0.01  # of the radiance: its spread, before it is known
-FAITH = 0.004  # of the radiance: the least spread
-HORIZON = 0.5  # of a pixel: the least spread of the horizon's edge
-CORRELATED, EDGES_CORRELATED = 12.0, 10.0  # residuals side by side that tell the same
 
 
 @dataclass(frozen=True)
 class Rim:
-    """``theta``: x, y, radius in metres in ``rig``, whose camera is tilted as fitted.
+    """``circle``: x, y, radius in metres in ``rig``, whose camera is tilted as fitted.
 
     ``deviation``: what the fit expects of the radius, relative (a standard deviation).
     """
 
-    theta: Array
+    circle: Array
     rig: Rig
     deviation: float
 
 
 def fit_rim(
-    view: View, rig: Rig, theta: Array, thorough: bool = True, tilt: float = TILT_PRIOR
+    view: View,
+    rig: Rig,
+    circle: Array,
+    thorough: bool = True,
+    tilt_deviation: float = RIM_FIT.tilt_deviation,
 ) -> Rim:
-    """The ball near ``theta``: x, y, radius in metres, some hundredths of the radius off.
+    """The ball near ``circle``: x, y, radius in metres, some hundredths of the radius off.
 
     ``view``: the photo out to about three radii, the ball some 60 pixels in radius. Levenberg's and
     Marquardt's steps, coarse to fine, with Cauchy's weights on the lines' residuals and on the
     distances from the horizon to the strongest edges near it. ``thorough``: from all of a stage's
-    starts, not only from those that fit best as they are. ``tilt``: deviation of the camera's from
-    what the rig tells, degrees.
+    starts, not only from those that fit best as they are. ``tilt_deviation``: expected error of the
+    rig's camera tilt, degrees.
     """
-    p = np.array([*theta, 0.0, 0.0, math.log(USUAL_BLUR), 0.0])
-    light = _mend(view.image @ np.array(LUMA, np.float32))
-    for count, blur, limit, turns, scales in STAGES:
-        lines = _Lines(view, light, rig, p, count, blur, limit, tilt)
+    p = np.array([*circle, 0.0, 0.0, math.log(RIM_FIT.expected_blur), 0.0])
+    light = _without_outliers(view.image @ np.array(LUMINANCE, np.float32))
+    for count, blur, limit, turns, scales in RIM_FIT.stages:
+        lines = _Lines(view, light, rig, p, count, blur, limit, tilt_deviation)
         starts = [p * [1, 1, k, 1, 1, 1, 1] for k in scales]
         spread, edge = np.min([lines.spreads(q) for q in starts], axis=0)
-        if len(starts) > LIKELIEST and not thorough:
+        if len(starts) > RIM_FIT.starts and not thorough:
             costs = [lines.solve(q, spread, edge, None).cost for q in starts]
-            starts = [starts[i] for i in np.argsort(costs)[:LIKELIEST]]
+            starts = [starts[i] for i in np.argsort(costs)[: RIM_FIT.starts]]
         found = [lines.descend(q, turns, spread, edge) for q in starts]
         _, p, information = min(found, key=lambda f: f[0])
     spread = math.sqrt(np.linalg.inv(information)[2, 2])
@@ -127,7 +113,7 @@ class _Fit:
     """A state of the fit: ``cost``, relative ``error`` and its robust ``weight`` (lines, samples),
     and the ``trace`` and ``horizon`` that it was made from.
 
-    ``table``: (lines, nodes), over ``scale`` (lines, 1), the usual radiance; ``matrix`` (lines,
+    ``table``: (lines, nodes), over ``scale`` (lines, 1), the median radiance; ``matrix`` (lines,
     samples, nodes) and ``solver``, its weighted pseudo-inverse.
     """
 
@@ -143,11 +129,11 @@ class _Fit:
 
 
 class _Lines:
-    """The lines of one stage, from ``NEAREST`` radii to where the table is known."""
+    """The lines of one stage, from `RIM_FIT.nearest` radii to where the table is known."""
 
     def __init__(
         self, view: View, light: Array, rig: Rig, p: Array, count: int, blur: float, limit: float,
-        tilt: float,
+        tilt_deviation: float,
     ) -> None:  # fmt: skip
         self.view, self.rig, self.blur, self.limit = view, rig, blur, limit
         self.light = ndimage.gaussian_filter(light, blur) if blur else light
@@ -156,20 +142,23 @@ class _Lines:
         self.radius = float(np.linalg.norm(outline[1] - outline[0])) / 2
         angle = np.arange(count) * (2 * math.pi / count)
         self.along = np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], -1)
-        low, high = NEAREST * self.radius, limit * self.radius - 1
+        low, high = RIM_FIT.nearest * self.radius, limit * self.radius - 1
         self.samples = np.arange(math.ceil(low), math.floor(high) + 1.0)
-        self.points = _single(np.arange(low - 4 + 0.5 / FINE, high + 4, 1 / FINE))
-        self.nodes = max(4, round(1 + (limit - 1) / (SPACING * (1 + blur))))
+        fine, margin = RIM_FIT.points_a_pixel, RIM_FIT.margin
+        self.points = _single(np.arange(low - margin + 0.5 / fine, high + margin, 1 / fine))
+        self.nodes = max(4, round(1 + (limit - 1) / (RIM_FIT.node_spacing * (1 + blur))))
         bend = np.diff(np.eye(self.nodes), 2, axis=0)
-        self.bend = bend.T @ bend / ROUGH**2
-        self.mirror = float(np.asarray(rig.ball_reflectance) @ LUMA)
+        self.bend = bend.T @ bend / RIM_FIT.roughness**2
+        self.mirror = float(np.asarray(rig.ball_reflectance) @ LUMINANCE)
         # Steps of the unknowns. A tilt moves the whole image: the ball goes along with it.
-        self.units = np.diag([*np.full(3, p[2] * 2e-3), 0.1, 0.1, 0.05, 0.01])
-        aim = 0.1 * rig.camera[2] * math.radians(1)
+        steps = np.array(RIM_FIT.steps)
+        steps[:3] *= p[2]
+        self.units = np.diag(steps)
+        aim = steps[3] * rig.camera[2] * math.radians(1)
         self.units[3, 1], self.units[4, 0] = aim, -aim
-        deviation = [tilt, tilt, BLUR_PRIOR, MIRROR_PRIOR]
-        self.prior = np.array([*np.full(3, 1e-9), *(1 / np.square(deviation))])
-        self.usual = np.array([0, 0, 0, 0, 0, math.log(USUAL_BLUR), 0])
+        deviation = [tilt_deviation] * 2 + [RIM_FIT.blur_deviation, RIM_FIT.reflectance_deviation]
+        self.prior = np.array([RIM_FIT.position_precision] * 3 + [1 / d**2 for d in deviation])
+        self.expected = np.array([0, 0, 0, 0, 0, math.log(RIM_FIT.expected_blur), 0])
 
     def trace(self, p: Array) -> _Trace:
         """Rays in the planes of the lines: x along the table, from the ball's centre; y up."""
@@ -182,7 +171,7 @@ class _Lines:
         up /= camera_y[:, None]
         # A view's position is linear in the ray (x, y, -1) of the camera.
         middle = view.at(centre, rig)
-        line = view.at(centre + 1.3 * radius * self.along, rig) - middle
+        line = view.at(centre + RIM_FIT.toward * radius * self.along, rig) - middle
         line /= np.sqrt((line * line).sum(-1))[:, None]
         focal = rig.focal(view.size[1]) / view.step
         start = -to_camera / (to_camera @ rig.camera_axes[2])
@@ -200,23 +189,24 @@ class _Lines:
         direct = np.abs(moment / ray_y)
         x, y = moment * ray_y - half * ray_x, -moment * ray_x - half * ray_y
         back_x, back_y = ray_x + 2 * half * x, ray_y + 2 * half * y
-        mirrored = np.abs(x - back_x * (y / np.minimum(back_y, -1e-3)))
-        mirrored[back_y > -0.03] = np.inf
+        mirrored = np.abs(x - back_x * (y / np.minimum(back_y, -RIM_FIT.least_downward)))
+        mirrored[back_y > -RIM_FIT.downward] = np.inf
         # The outline: where a ray touches the circle, or the rim on the table, if it is seen.
         touch = np.arctan2(camera_y, camera_x) - np.arccos(radius / np.hypot(camera_x, camera_y))
         touch = np.maximum(touch, 0)[:, None]
         edge = np.cos(touch) * self.along + np.sin(touch) * up
         outline = view.at(centre + radius * edge, rig) - middle
         outline = np.sqrt((outline * outline).sum(-1))[:, None]
-        inside = np.clip((_single(outline) - self.points) * FINE + 0.5, 0, 1)
+        inside = (_single(outline) - self.points) * RIM_FIT.points_a_pixel + 0.5
+        inside = np.clip(inside, 0, 1)
 
         seen = sample_image(self.light, middle + self.samples[:, None] * line[:, None])
         beyond = (mirrored > self.limit) & (inside > 0)
         far, hidden = np.zeros_like(mirrored), np.zeros(beyond.shape, bool)
-        reach = np.minimum(mirrored[beyond], FARTHEST) * radius
+        reach = np.minimum(mirrored[beyond], RIM_FIT.farthest) * radius
         place = view.at(centre + reach[:, None] * self.along[np.nonzero(beyond)[0]], rig)
         shown = (place > 0).all(-1) & (place < self.light.shape[::-1]).all(-1)
-        hidden[beyond] = ~shown | (mirrored[beyond] > FARTHEST)
+        hidden[beyond] = ~shown | (mirrored[beyond] > RIM_FIT.farthest)
         far[beyond] = sample_image(self.farther, place)
         return _Trace(mirrored, direct, inside, far, hidden, seen)
 
@@ -229,7 +219,8 @@ class _Lines:
     def node(self, distance: Array) -> Array:
         """Where the unknown table has a distance from the centre, in nodes."""
         last = self.nodes - 1
-        return np.clip((distance - 1) * (last / (self.limit - 0.98)), 0, last - 1e-3)
+        scale = last / (self.limit - RIM_FIT.last_node)
+        return np.clip((distance - 1) * scale, 0, last - RIM_FIT.inside_last)
 
     def hats(self, distance: Array, weight: Array) -> Array:
         """The nodes' shares of a distance, times ``weight``: (lines, points, nodes)."""
@@ -247,25 +238,28 @@ class _Lines:
         t, kernel = self.trace(p), self.kernel(p)
         mirror = self.mirror * math.exp(p[_MIRROR])
         known = t.inside * (t.mirrored > self.limit)
-        valid = (known * t.hidden) @ kernel.T < 0.02
+        valid = (known * t.hidden) @ kernel.T < RIM_FIT.hidden_share
         near = (t.inside - known) * mirror
         hats = self.hats(t.mirrored, near) + self.hats(t.direct, 1 - t.inside)
         matrix = kernel @ hats
-        scale = np.median(t.seen, 1, keepdims=True) + 1e-3 * t.seen.mean() + 1e-9
+        dark, black = RIM_FIT.dark
+        scale = np.median(t.seen, 1, keepdims=True) + dark * t.seen.mean() + black
         right = (t.seen - (known * t.far * mirror) @ kernel.T) / scale
         weight = _single(valid) if weight is None else valid * _single(weight)
         weighted = (matrix * weight[..., None]).transpose(0, 2, 1)
-        smooth = spread**2 * self.bend + 1e-6 * np.eye(self.nodes)
+        smooth = spread**2 * self.bend + RIM_FIT.ridge * np.eye(self.nodes)
         solver = _single(np.linalg.solve(weighted @ matrix + smooth, weighted))
         table = (solver @ right[..., None])[..., 0]
         error = right - (matrix @ table[..., None])[..., 0]
-        relative = (error / (ROBUST * spread)) ** 2
-        # A sample that the photo leaves open costs what a usual one does.
-        cost = float(np.log1p(np.where(valid, relative, 0.25)).sum()) * ROBUST**2 / CORRELATED
-        cost += float(np.sum((table @ self.bend) * table)) / CORRELATED
+        robust, correlated = RIM_FIT.robust, RIM_FIT.correlated
+        relative = (error / (robust * spread)) ** 2
+        # A sample whose table the photo does not show costs what a typical one does.
+        relative_or_typical = np.where(valid, relative, RIM_FIT.unseen_cost)
+        cost = float(np.log1p(relative_or_typical).sum()) * robust**2 / correlated
+        cost += float(np.sum((table @ self.bend) * table)) / correlated
         horizon = self.horizon(p)
         *_, off, strength = horizon
-        cost += float((strength * np.log1p((off / edge) ** 2)).sum()) / EDGES_CORRELATED
+        cost += float((strength * np.log1p((off / edge) ** 2)).sum()) / RIM_FIT.edges_correlated
         cost += float(self.prior @ (self.off(p) ** 2))
         return _Fit(cost, error, valid / (1 + relative), t, horizon, table, matrix, solver, scale)
 
@@ -286,24 +280,25 @@ class _Lines:
 
     def off(self, p: Array) -> Array:
         """How far the unknowns are from what the prior expects; nought for the ball itself."""
-        return (p - self.usual) * (np.arange(len(p)) >= 3)
+        return (p - self.expected) * (np.arange(len(p)) >= 3)
 
     def horizon(self, p: Array) -> tuple[Array, Array, Array, Array]:
-        """The horizon (n, 2), its normals, the signed distance to its edge, and that's weight."""
-        curve = horizon_curve(self.view, _tilted(self.rig, p), p, 120)
+        """The horizon (n, 2), its normals, the signed distances to its edge, and their weights."""
+        curve = horizon_curve(self.view, _tilted(self.rig, p), p, RIM_FIT.horizon_points)
         normal = normals(curve)
-        reach = max(2.0, 0.05 * self.radius * 0.5 ** (3 - self.blur))
+        pixels, radii = RIM_FIT.horizon_reach
+        reach = max(pixels, radii * self.radius * 0.5 ** (3 - self.blur))
         return curve, normal, *edges(self.view, curve, normal, reach)
 
     def spreads(self, p: Array) -> tuple[float, float]:
-        """The usual residual of the lines with the ball at ``p``, and of the horizon's edge."""
-        fit = self.solve(p, GUESS, 1.0, None)
-        rest = np.abs(fit.error[fit.weight > 0])
+        """The spread of the lines' residuals with the ball at ``p``, and of the horizon's edge."""
+        fit = self.solve(p, RIM_FIT.first_spread, 1.0, None)
+        errors = fit.error[fit.weight > 0]
         *_, off, strength = fit.horizon
-        strong = np.abs(off[strength > 0.1])
-        edge = float(np.median(strong)) if strong.size else 0.0
-        spread = float(np.median(rest)) if rest.size else 1.0
-        return max(FAITH, 1.48 * spread), max(HORIZON, 1.48 * edge)
+        strong = off[strength > RIM_FIT.strong_edge]
+        edge = float(robust_spread(strong)) if strong.size else 0.0
+        spread = float(robust_spread(errors if errors.size else np.ones(1)))
+        return max(RIM_FIT.least_spread, spread), max(RIM_FIT.horizon_spread, edge)
 
     def descend(
         self, p: Array, turns: int, spread: float, edge: float
@@ -317,7 +312,7 @@ class _Lines:
             for _ in range(4):
                 damped = information + np.diag(np.diag(information)) * damping
                 step = -np.linalg.solve(damped, gradient)
-                step *= min(1, 8 / max(np.abs(step).max(), 1e-12))
+                step *= min(1, RIM_FIT.longest_step / max(np.abs(step).max(), TINY))
                 tried = self.solve(p + step @ self.units, spread, edge, fit.weight)
                 if tried.cost < fit.cost:
                     break
@@ -327,7 +322,7 @@ class _Lines:
             gained = fit.cost - tried.cost
             p, fit, damping = p + step @ self.units, tried, max(damping / 5, 1e-4)
             information, gradient = self.normal_equations(p, fit, spread, edge)
-            if gained < 0.05:
+            if gained < RIM_FIT.least_gain:
                 break
         return fit.cost, p, information
 
@@ -347,15 +342,16 @@ class _Lines:
             lines[k] = self.residual(p + unit, trace, fit) - base
         slope = lines - (fit.matrix @ (fit.solver @ lines[..., None]))[..., 0]
         slope = slope.reshape(len(p), -1)
-        weighted = slope * (fit.weight.reshape(-1) / spread**2 / CORRELATED)
+        weighted = slope * (fit.weight.reshape(-1) / spread**2 / RIM_FIT.correlated)
         matrix = self.units @ np.diag(self.prior) @ self.units.T + weighted @ slope.T
         gradient = self.units @ (self.prior * self.off(p)) + weighted @ fit.error.reshape(-1)
-        weighted = horizon * (strength / (1 + (off / edge) ** 2) / edge**2 / EDGES_CORRELATED)
+        weight = strength / (1 + (off / edge) ** 2)
+        weighted = horizon * (weight / edge**2 / RIM_FIT.edges_correlated)
         return matrix + weighted @ horizon.T, gradient - weighted @ off
 
 
-def _mend(image: Array) -> Array:
-    """The image (h, w) with single pixels replaced that stand out from the eight around them."""
-    usual = ndimage.median_filter(image, 3)
-    off = np.abs(image - usual)
-    return np.where(off > OUT * 1.48 * np.median(off), usual, image)
+def _without_outliers(image: Array) -> Array:
+    """The image (h, w) with single pixels replaced that differ from the eight around them."""
+    smooth = ndimage.median_filter(image, 3)
+    off = image - smooth
+    return np.where(np.abs(off) > RIM_FIT.outlier * robust_spread(off), smooth, image)

@@ -1,4 +1,7 @@
-"""The part of a photo around the mirror ball, and the curves and edges in it."""
+"""The part of a photo around the mirror ball, and the curves and edges in it.
+
+A ball is given by its circle (3,): x and y of its centre on the table, and its radius, in metres.
+"""
 
 from __future__ import annotations
 
@@ -10,20 +13,18 @@ import numpy as np
 from scipy import ndimage
 
 from invrender.capture.mirror import horizon_points, outline_points
+from invrender.capture.settings import BALL_VIEW, TINY
 from invrender.files.images import Photo
 from invrender.rig import Rig
 from invrender.types import Array
-
-TOE = 0.1  # added to radiance over its median before the logarithm
-BLURS = (0.7, 1.4, 2.8, 5.6, 11.2)  # of the levels, in the view's pixels
 
 
 @dataclass(frozen=True)
 class View:
     """A part of a photo of ``size`` (H, W), shrunk ``step`` times; it begins at ``origin`` (x, y).
 
-    ``image`` (h, w, 3): linear radiance over its median, at most 20. Photo pixel p is view position
-    (p - origin) / step.
+    ``image`` (h, w, 3): linear radiance over its median, cut at `BALL_VIEW.brightest`. Photo pixel
+    p is view position (p - origin) / step.
     """
 
     origin: Array
@@ -34,18 +35,21 @@ class View:
     @cached_property
     def tone(self) -> Array:
         """Logarithm of the radiance, (h, w, 3)."""
-        return np.asarray(np.log(self.image + TOE))
+        return np.asarray(np.log(self.image + BALL_VIEW.toe))
 
     @cached_property
     def levels(self) -> Array:
         """The image ever more blurred, (5, h, w, 3)."""
-        blurred = [ndimage.gaussian_filter(self.image, (a, a, 0), mode="nearest") for a in BLURS]
+        blurred = [
+            ndimage.gaussian_filter(self.image, (a, a, 0), mode="nearest") for a in BALL_VIEW.blurs
+        ]
         return np.stack(blurred).astype(np.float32)
 
     @cached_property
     def tensor(self) -> Array:
         """The structure tensor of the tone summed over the channels, (h, w, 3): xx, xy, yy."""
-        smooth = ndimage.gaussian_filter(self.tone, (1.2, 1.2, 0), mode="nearest")
+        blur = (BALL_VIEW.tensor_blur, BALL_VIEW.tensor_blur, 0)
+        smooth = ndimage.gaussian_filter(self.tone, blur, mode="nearest")
         gy, gx = (
             ndimage.correlate1d(smooth, [-0.5, 0, 0.5], axis=a, mode="nearest") for a in (0, 1)
         )
@@ -54,8 +58,9 @@ class View:
 
     @cached_property
     def noise(self) -> float:
-        """The structure tensor's usual trace."""
-        return float(np.median(self.tensor[..., 0] + self.tensor[..., 2])) + 1e-7
+        """The median of the structure tensor's trace."""
+        trace = self.tensor[..., 0] + self.tensor[..., 2]
+        return float(np.median(trace)) + BALL_VIEW.least_noise
 
     def at(self, points: Array, rig: Rig) -> Array:
         """Points in space to view positions (..., 2), x right, y down."""
@@ -75,51 +80,57 @@ def view_around(photo: Photo, middle: Array, reach: float, shrink: float) -> Vie
     high = low + count * step
     part = photo.image[low[1] : high[1], low[0] : high[0]]
     part = part.reshape(count[1], step, count[0], step, 3).mean((1, 3))
-    level = max(float(np.median(part)), 1e-6 * float(part.max()), 1e-12)
+    level = max(float(np.median(part)), BALL_VIEW.least_level * float(part.max()), TINY)
     return View(
-        low.astype(float), step, (photo.height, photo.width), np.minimum(part / level, 20.0)
+        low.astype(float),
+        step,
+        (photo.height, photo.width),
+        np.minimum(part / level, BALL_VIEW.brightest),
     )
 
 
-def horizon_curve(view: View, rig: Rig, theta: Array, count: int) -> Array:
-    """The horizon's image in the view (count, 2) with the ball at ``theta``: x, y, radius."""
-    return view.at(horizon_points(rig, _place(theta), theta[2], count), rig)
+def horizon_curve(view: View, rig: Rig, circle: Array, count: int) -> Array:
+    """The image of the horizon in the ball, view positions (count, 2)."""
+    return view.at(horizon_points(rig, _centre(circle), circle[2], count), rig)
 
 
-def outline_curve(view: View, rig: Rig, theta: Array, count: int) -> Array:
-    """The ball's outline in the view, likewise."""
-    return view.at(outline_points(rig, _place(theta), theta[2], count), rig)
+def outline_curve(view: View, rig: Rig, circle: Array, count: int) -> Array:
+    """The ball's outline, view positions (count, 2)."""
+    return view.at(outline_points(rig, _centre(circle), circle[2], count), rig)
 
 
-def _place(theta: Array) -> Array:
-    return np.array([theta[0], theta[1], 0.0])
+def _centre(circle: Array) -> Array:
+    return np.array([circle[0], circle[1], 0.0])
 
 
 def normals(curve: Array) -> Array:
     """Outward unit normals (n, 2) of a closed curve (n, 2)."""
     along = np.roll(curve, -1, 0) - np.roll(curve, 1, 0)
     normal = np.stack([along[:, 1], -along[:, 0]], -1)
-    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), TINY)
     outward = np.sum(normal * (curve - curve.mean(0)), -1, keepdims=True)
     return np.asarray(normal * np.where(outward < 0, -1, 1))
 
 
 def edges(view: View, curve: Array, normal: Array, reach: float) -> tuple[Array, Array]:
     """Signed distance (n,) along each normal to the strongest edge, and its weight in [0, 1]."""
-    t = np.arange(-math.ceil(reach * 4) - 8, math.ceil(reach * 4) + 9) / 4
+    per_pixel, margin = BALL_VIEW.edge_steps, BALL_VIEW.edge_margin
+    count = math.ceil(reach * per_pixel) + margin
+    t = np.arange(-count, count + 1) / per_pixel
     at = curve[:, None] + t[None, :, None] * normal[:, None]
     at = np.stack([at[..., 1] - 0.5, at[..., 0] - 0.5])
     slope = np.zeros(at.shape[1:])
     for c in range(3):
         line = ndimage.map_coordinates(view.tone[..., c], at, order=1, mode="nearest")
-        slope += ndimage.gaussian_filter1d(line, 3.0, axis=1, order=1, mode="nearest") ** 2
-    i = np.argmax(slope[:, 8:-8], 1) + 8
+        line = ndimage.gaussian_filter1d(line, BALL_VIEW.edge_blur, axis=1, order=1, mode="nearest")
+        slope += line**2
+    i = np.argmax(slope[:, margin:-margin], 1) + margin
     row = np.arange(len(curve))
-    a, b, c2 = (np.sqrt(slope[row, i + k]) for k in (-1, 0, 1))
-    bend = a - 2 * b + c2
+    before, here, after = (np.sqrt(slope[row, i + k]) for k in (-1, 0, 1))
+    bend = before - 2 * here + after
     with np.errstate(divide="ignore", invalid="ignore"):
-        shift = np.where(bend < 0, 0.5 * (a - c2) / bend, 0)
-    interior = (i > 8) & (i < len(t) - 9)
-    usual = np.median(slope) + 1e-8
-    strength = np.clip(b**2 / (30 * usual) - 0.5, 0, 1)
-    return t[i] + np.clip(shift, -0.5, 0.5) / 4, strength * interior
+        shift = np.where(bend < 0, 0.5 * (before - after) / bend, 0)
+    interior = (i > margin) & (i < len(t) - margin - 1)
+    typical = np.median(slope) + BALL_VIEW.least_slope
+    strength = np.clip(here**2 / (BALL_VIEW.edge_strength * typical) - 0.5, 0, 1)
+    return t[i] + np.clip(shift, -0.5, 0.5) / per_pixel, strength * interior

@@ -3,10 +3,10 @@
 A hand holds the camera a few millimetres and degrees off, and the square of the sample is then not
 where the rig says. Its four sides are straight lines along which the photo changes; textures
 change here and there. So for each side and each line near it, the signed change across is averaged
-over pieces of the line, which texture does not survive, and the pieces' squares, relative to what
-is usual, are summed (as a Hough transform does, of gradients). The pose that explains the four best
-lines together, under a Gaussian prior, is taken: eight numbers for six unknowns, and what disagrees
-is told by what is left.
+over pieces of the line, which texture does not survive. The squares of these means, relative to
+their medians over all lines, are summed (as a Hough transform does, of gradients). The pose that
+explains the four best lines together, under a Gaussian prior, is taken. It has six unknowns and
+the lines give eight numbers, so that what is left over shows whether they belong together.
 """
 
 from __future__ import annotations
@@ -19,72 +19,57 @@ import numpy as np
 from scipy import ndimage
 
 from invrender.capture.ball_image import sample_image
-from invrender.capture.ball_rim import TILT_PRIOR
 from invrender.capture.ball_view import View, view_around
+from invrender.capture.settings import RIM_FIT, SQUARE_FIT, TINY
 from invrender.files.images import Photo
 from invrender.rig import Rig
 from invrender.types import Array, InputError
 
-PIECES, POINTS = 8, 16  # of a side, and along each
-INSET = 0.03  # of a side, what is left out at its ends
-SHIFT, TILT = 0.028, 1.5  # deviations of the camera's place, in sides; and of its tilt in degrees
-BLUR, WIDE = 1.7, 0.013  # of changes: pixels, sides
-BORDER = 0.3, 0.5  # deviations of a border's place and slope, in pixels
-LEAST = 0.3  # of the greatest change near a side's points, what its border has
-BEST = 5  # lines a side that are combined
-# Pixels of a side, how far off lines are looked for in sides, steps, how far askew in sides; and in
-# pixels the spacing of the places tried, and the deviations of a line's place and slope.
-PASSES = ((256, 0.15, 1, 0.06, 1.0, 1.0, 1.5), (512, 0.02, 2, 0.015, 0.5, 0.8, 1.2))
-MISFIT, UNLIKELY = 25.0, 14.0  # squared deviations: of the lines, two are left; of the pose, six
-# Of three sides, the changes on the line must exceed by so much the greatest tenth of those beside
-# it, and half of the points change most there, or the whole side's by more. Where the rig tells it,
-# the median; then it is kept, unless the changes found elsewhere are that much larger (a sum of
-# four logarithms): a sample may have lines of its own.
-FOUND, MOST, WHOLE, TOLD, BETTER = 2.0, 0.5, 10.0, 12.0, 1.8
-LEAST_SIDE = 32  # pixels of a side that tells anything
-MOVED = 0.004  # of a side, from which a found pose is believed rather than the told one
-# What to expect of the tilt, degrees: as found, and as told where no square is seen.
-FOUND_TILT, TOLD_TILT = 0.3, 2.0
-
 
 def find_camera(photo: Photo, rig: Rig) -> tuple[Rig, float]:
-    """The rig with its camera where the photo's square of the sample says; and the deviation to
-    expect of the camera's tilt, in degrees.
+    """The rig with its camera where the photo's square of the sample says; and the expected error
+    of the camera's tilt, in degrees.
 
-    As told where the square is as plain there, or plain nowhere near.
+    The rig stays as it is where its own square is as clear in the photo, or none is near.
     """
     try:
         pose = _find(photo, rig)
     except InputError:  # a camera that no rig may have
         pose = None
     if pose is None:
-        return rig, TOLD_TILT
+        return rig, SQUARE_FIT.unseen_tilt
     at = [corners(photo, r) for r in (rig, _posed(rig, pose))]
     moved = np.linalg.norm(at[1] - at[0], axis=-1).mean()
-    if moved > MOVED * np.linalg.norm(at[0][1] - at[0][0]):
-        return _posed(rig, pose), FOUND_TILT
-    return rig, TILT_PRIOR
+    if moved > SQUARE_FIT.least_move * np.linalg.norm(at[0][1] - at[0][0]):
+        return _posed(rig, pose), SQUARE_FIT.found_tilt
+    return rig, RIM_FIT.tilt_deviation
 
 
 def _find(photo: Photo, rig: Rig) -> Array | None:
-    """The camera's pose, in deviations of the prior; None where the square is plain nowhere."""
+    """The camera's pose, in deviations of the prior; None where no square is clear."""
     if not _in_photo(photo, corners(photo, rig)):
         return None
-    views = [_view(photo, rig, pixels) for pixels, *_ in PASSES]
-    told = _sides(views[-1], rig)
+    views = [_view(photo, rig, pixels) for pixels, *_ in SQUARE_FIT.passes]
+    nominal = _sides(views[-1], rig)
     pose: Array = np.zeros(6)
-    if np.all(told.median > TOLD):  # all four: no need to look elsewhere
+    if np.all(nominal.median > SQUARE_FIT.nominal):  # all four: no need to look elsewhere
         return pose
     misfit = 0.0
-    for view, (_, reach, turns, askew, step, *deviations) in zip(views, PASSES, strict=True):
+    passes = zip(views, SQUARE_FIT.passes, strict=True)
+    for view, (_, reach, turns, askew, step, *deviations) in passes:
         for _ in range(turns):
             if not _inside(view, _ends(view, _posed(rig, pose))):
                 return None
             pose, misfit = _improve(view, rig, pose, reach, askew, step, np.tile(deviations, 4))
     found = _sides(view, _posed(rig, pose))
-    likely = misfit <= MISFIT and pose @ pose <= UNLIKELY and found.plain()
-    better = np.log(found.on / told.on).sum() > BETTER
-    if np.sum(told.median > TOLD) >= 3 and not (likely and better):
+    likely = (
+        misfit <= SQUARE_FIT.greatest_misfit
+        and pose @ pose <= SQUARE_FIT.greatest_pose
+        and found.clear()
+    )
+    # The nominal square stays unless another is much clearer: a sample may have lines of its own.
+    better = np.log(found.on / nominal.on).sum() > SQUARE_FIT.better
+    if np.sum(nominal.median > SQUARE_FIT.nominal) >= 3 and not (likely and better):
         return np.zeros(6)
     if not likely:
         return None
@@ -98,7 +83,7 @@ def _in_photo(photo: Photo, at: Array) -> bool:
     """Whether a square with those corners is about in the photo, and large enough."""
     size, middle = np.array([photo.width, photo.height]), at.mean(0)
     near = np.all((at > -size) & (at < 2 * size)) and np.all((middle > 0) & (middle < size))
-    return bool(near and np.ptp(at, 0).min() > LEAST_SIDE)
+    return bool(near and np.ptp(at, 0).min() > SQUARE_FIT.least_side)
 
 
 def corners(photo: Photo, rig: Rig) -> Array:
@@ -110,8 +95,10 @@ def _posed(rig: Rig, pose: Array) -> Rig:
     """The rig with its camera moved: shift and tilt in deviations of the prior."""
     return replace(
         rig,
-        camera_shift=tuple(np.add(rig.camera_shift, pose[:3] * SHIFT * rig.sample_size)),
-        camera_tilt=tuple(np.add(rig.camera_tilt, pose[3:] * TILT)),
+        camera_shift=tuple(
+            np.add(rig.camera_shift, pose[:3] * SQUARE_FIT.shift_deviation * rig.sample_size)
+        ),
+        camera_tilt=tuple(np.add(rig.camera_tilt, pose[3:] * SQUARE_FIT.tilt_deviation)),
     )
 
 
@@ -119,7 +106,7 @@ def _view(photo: Photo, rig: Rig, pixels: float) -> View:
     """The photo around where the square may be, a side of it about so many pixels."""
     at = corners(photo, rig)
     side = float(np.linalg.norm(at[1] - at[0]))
-    half = np.abs(at - at.mean(0)).max() + 1.5 * PASSES[0][1] * side
+    half = np.abs(at - at.mean(0)).max() + SQUARE_FIT.view_margin * SQUARE_FIT.passes[0][1] * side
     return view_around(photo, at.mean(0), half, side / pixels)
 
 
@@ -160,7 +147,10 @@ def _slopes(view: View, rig: Rig, pose: Array) -> Array:
         off = ((_ends(view, _posed(rig, pose)) - now) * normal[:, None]).sum(-1)
         return np.stack([off.mean(1), off[:, 1] - off[:, 0]], -1).ravel()
 
-    return np.stack([(lines(pose + u) - lines(pose - u)) / 0.1 for u in 0.05 * np.eye(6)], -1)
+    step = SQUARE_FIT.slope_step
+    return np.stack(
+        [(lines(pose + u) - lines(pose - u)) / (2 * step) for u in step * np.eye(6)], -1
+    )
 
 
 def _solve(slopes: Array, pose: Array, wanted: Array, deviation: Array) -> Array:
@@ -175,28 +165,32 @@ def _outermost(view: View, ends: Array) -> tuple[Array, Array]:
     """Where the sides' outermost changes lie, place and slope, and the deviations of these, (8,).
 
     A sample has lines beside its border, a plain table has none: from outside inwards the first
-    change that is no table's is the border. A side beside a table that changes as much stays.
+    change that is larger than the table's is the border. A side beside a table that changes as much
+    stays.
     """
-    t = np.arange(-24, 49) * 0.5
-    outside, near = t >= 9, np.flatnonzero(t <= 9)
-    wanted, deviation = np.zeros((4, 2)), np.tile(np.array(PASSES[-1][-2:]) / 2, (4, 1))
+    inwards, outwards, border = SQUARE_FIT.outward
+    t = np.arange(inwards, outwards) * 0.5
+    outside, near = t >= border, np.flatnonzero(t <= border)
+    wanted = np.zeros((4, 2))
+    deviation = np.tile(np.array(SQUARE_FIT.passes[-1][-2:]) / 2, (4, 1))
     for k, side in enumerate(ends):
-        change, u = _changes(view, side, t, BLUR)
+        change, u = _changes(view, side, t, SQUARE_FIT.blur)
         size = np.sqrt((change**2).sum(0))
-        usual = np.median(size[near].max(0))
-        over = size[near] > max(2.5 * np.quantile(size[outside], 0.95), LEAST * usual)
+        table = np.quantile(size[outside], SQUARE_FIT.table_quantile)
+        median = np.median(size[near].max(0))
+        over = size[near] > max(SQUARE_FIT.table_change * table, SQUARE_FIT.least_change * median)
         some = over.any(0)
         first = len(near) - 1 - np.argmax(over[::-1], 0)
-        rows = np.maximum(first - np.arange(7)[:, None], 0)  # the peak behind it
+        rows = np.maximum(first - np.arange(SQUARE_FIT.behind)[:, None], 0)  # the peak behind it
         peak = t[first - np.argmax(np.take_along_axis(size, rows, 0), 0)]
         a = np.stack([np.ones_like(u), u - 0.5], -1)[some]
         line = np.array([np.median(peak[some]), 0.0]) if some.any() else np.zeros(2)
-        for _ in range(10):
+        for _ in range(SQUARE_FIT.rounds):
             weight = 1 / (1 + (peak[some] - a @ line) ** 2)
-            line = np.linalg.solve(a.T @ (weight[:, None] * a) + 1e-6 * np.eye(2),
-                                   a.T @ (weight * peak[some]))  # fmt: skip
-        if np.sum(np.abs(peak[some] - a @ line) < 1) > MOST * len(u):
-            wanted[k], deviation[k] = line, BORDER
+            matrix = a.T @ (weight[:, None] * a) + SQUARE_FIT.ridge * np.eye(2)
+            line = np.linalg.solve(matrix, a.T @ (weight * peak[some]))
+        if np.sum(np.abs(peak[some] - a @ line) < 1) > SQUARE_FIT.most * len(u):
+            wanted[k], deviation[k] = line, SQUARE_FIT.border_deviation
     return wanted.ravel(), deviation.ravel()
 
 
@@ -210,7 +204,8 @@ def _normals(ends: Array) -> Array:
 def _changes(view: View, ends: Array, t: Array, blur: float) -> tuple[Array, Array]:
     """How the tone changes across a side (2, 2) at distances t (n,) from it: (3, n, points); and
     where on the side the points are, from 0 to 1."""
-    u = (np.arange(PIECES * POINTS) + 0.5) / (PIECES * POINTS) * (1 - 2 * INSET) + INSET
+    count, inset = SQUARE_FIT.pieces * SQUARE_FIT.points, SQUARE_FIT.inset
+    u = (np.arange(count) + 0.5) / count * (1 - 2 * inset) + inset
     step = t[1] - t[0]
     more = round(3 * blur / step)
     far = np.concatenate(
@@ -224,18 +219,20 @@ def _changes(view: View, ends: Array, t: Array, blur: float) -> tuple[Array, Arr
 
 def _even(change: Array) -> Array:
     """Changes such that no single one outweighs the others, in [-1, 1]."""
-    return change / np.sqrt(change**2 + (4 * np.median(np.abs(change)) + 1e-6) ** 2)
+    times, least = SQUARE_FIT.even
+    return change / np.sqrt(change**2 + (times * np.median(np.abs(change)) + least) ** 2)
 
 
 def _power(change: Array) -> Array:
     """Squares (..., pieces) of the means of changes (3, ..., points) over pieces of the line."""
-    pieces = change.reshape(*change.shape[:-1], PIECES, POINTS) @ np.full(POINTS, 1 / POINTS)
+    count, points = SQUARE_FIT.pieces, SQUARE_FIT.points
+    pieces = change.reshape(*change.shape[:-1], count, points) @ np.full(points, 1 / points)
     return np.asarray((pieces**2).sum(0))
 
 
 @dataclass(frozen=True)
 class _Sides:
-    """How plain the square's sides are, (4,) each.
+    """How clear the square's sides are, (4,) each.
 
     ``on``: the changes on it; ``median``, ``tenth``: over the median and the greatest tenth of
     those beside it; ``most``: the share of its points that change most there. ``wide``: as
@@ -250,17 +247,17 @@ class _Sides:
     wide: Array
     whole: Array
 
-    def plain(self) -> bool:
+    def clear(self) -> bool:
         """Whether three are lines, or steps, as textures make none."""
-        sharp = (self.tenth > FOUND) & (self.most > MOST)
-        step = (self.wide > FOUND) & (self.whole > WHOLE)
+        sharp = (self.tenth > SQUARE_FIT.clear) & (self.most > SQUARE_FIT.most)
+        step = (self.wide > SQUARE_FIT.clear) & (self.whole > SQUARE_FIT.whole)
         return bool(max(sharp.sum(), step.sum()) >= 3)
 
 
 def _sides(view: View, rig: Rig) -> _Sides:
     """Next to nothing where the view does not show all of them."""
     ends = _ends(view, rig)
-    out = np.full((6, 4), 1e-3)
+    out = np.full((6, 4), SQUARE_FIT.least_power[0])
     if _inside(view, ends):
         out[:] = np.transpose([_side(view, side) for side in ends])
     return _Sides(*out)
@@ -268,44 +265,50 @@ def _sides(view: View, rig: Rig) -> _Sides:
 
 def _side(view: View, side: Array) -> tuple[Any, ...]:
     """The numbers of `_Sides` for one side (2, 2)."""
-    t = np.arange(-30, 31) * 0.5
-    change, _ = _changes(view, side, t, BLUR)
+    tenth, (least_on, least, least_whole) = SQUARE_FIT.tenth, SQUARE_FIT.least_power
+    reach, within, beyond = SQUARE_FIT.near
+    t = np.arange(-reach, reach + 1) * 0.5
+    change, _ = _changes(view, side, t, SQUARE_FIT.blur)
     power = _power(_even(change))
-    on, beside = power[np.abs(t) <= 1].max(0), power[np.abs(t) >= 4]
-    usual = (np.quantile(beside, q, axis=0) + 1e-4 for q in (0.5, 0.9))
-    most = np.abs(t[np.argmax((change**2).sum(0), 0)]) <= 1.5
-    t = np.arange(-60.0, 61)
-    near, far = np.abs(t) <= 3, np.abs(t) >= 20
-    change, _ = _changes(view, side, t, WIDE * float(np.linalg.norm(side[1] - side[0])))
+    on, beside = power[np.abs(t) <= within].max(0), power[np.abs(t) >= beyond]
+    levels = (np.quantile(beside, q, axis=0) + least for q in (0.5, tenth))
+    most = np.abs(t[np.argmax((change**2).sum(0), 0)]) <= SQUARE_FIT.peak_on
+    reach, within, beyond = SQUARE_FIT.wide
+    t = np.arange(-reach, reach + 1.0)
+    near, far = np.abs(t) <= within, np.abs(t) >= beyond
+    length = float(np.linalg.norm(side[1] - side[0]))
+    change, _ = _changes(view, side, t, SQUARE_FIT.wide_blur * length)
     power = _power(_even(change))
-    wide = np.median(power[near].max(0) / (np.quantile(power[far], 0.9, axis=0) + 1e-4))
+    wide = np.median(power[near].max(0) / (np.quantile(power[far], tenth, axis=0) + least))
     mean = (change.mean(-1) ** 2).sum(0)
-    whole = mean[near].max() / (np.quantile(mean[far], 0.9) + 1e-9)
-    return np.median(on) + 1e-3, *(np.median(on / u) for u in usual), most.mean(), wide, whole
+    whole = mean[near].max() / (np.quantile(mean[far], tenth) + least_whole)
+    over = (np.median(on / level) for level in levels)
+    return np.median(on) + least_on, *over, most.mean(), wide, whole
 
 
 def _best_lines(view: View, ends: Array, reach: float, askew: float, step: float) -> list[Array]:
-    """The `BEST` lines near a side (2, 2): place, slope, and how much plainer than usual.
+    """The `SQUARE_FIT.best` lines near a side (2, 2): place, slope, and how clear each is against
+    the median line.
 
     Place and slope in pixels outwards.
     """
     n, m = round(reach / step), round(askew / step)
     places, slopes = np.arange(-n, n + 1) * step, np.arange(-m, m + 1) * step
     far = n + round(askew / step / 2) + 1
-    plain = np.zeros((len(slopes), len(places)))
+    clear = np.zeros((len(slopes), len(places)))
     length = float(np.linalg.norm(ends[1] - ends[0]))
-    for blur in (BLUR, WIDE * length):
+    for blur in (SQUARE_FIT.blur, SQUARE_FIT.wide_blur * length):
         change, u = _changes(view, ends, np.arange(-far, far + 1) * step, blur)
         first = np.round(slopes[:, None] * (u - 0.5) / step).astype(int) + far - n
         row = first[:, None] + np.arange(2 * n + 1)[:, None]  # (slope, place, point)
         power = _power(_even(change)[:, row, np.arange(len(u))])
-        power /= np.median(power, (0, 1)) + 1e-4
-        plain += np.log1p(power / 3).sum(-1)
-    peaks = np.argwhere(plain == ndimage.maximum_filter(plain, 9))
-    peaks = peaks[np.argsort(-plain[tuple(peaks.T)])][:BEST]
+        power /= np.median(power, (0, 1)) + SQUARE_FIT.least_power[1]
+        clear += np.log1p(power / 3).sum(-1)
+    peaks = np.argwhere(clear == ndimage.maximum_filter(clear, 9))
+    peaks = peaks[np.argsort(-clear[tuple(peaks.T)])][: SQUARE_FIT.best]
     return [
-        np.array([places[j] + step * _top(plain[i], j), slopes[i] + step * _top(plain[:, j], i),
-                  plain[i, j]])
+        np.array([places[j] + step * _top(clear[i], j), slopes[i] + step * _top(clear[:, j], i),
+                  clear[i, j]])
         for i, j in peaks
     ]  # fmt: skip
 
@@ -315,4 +318,4 @@ def _top(values: Array, i: int) -> float:
     if not 0 < i < len(values) - 1:
         return 0.0
     a, b, c = values[i - 1 : i + 2]
-    return float(0.5 * (a - c) / min(a - 2 * b + c, -1e-9))
+    return float(0.5 * (a - c) / min(a - 2 * b + c, -TINY))

@@ -10,36 +10,30 @@ from __future__ import annotations
 import numpy as np
 from scipy import optimize
 
-from invrender.capture.ball_image import window
+from invrender.capture.ball_image import BallImage
 from invrender.capture.environment import fill_environment, unfold_environment
-from invrender.capture.mirror import Ball
+from invrender.capture.robust import cauchy_residuals, spread
+from invrender.capture.settings import CLIPPED_LAMPS, TABLE_METER, TINY
 from invrender.capture.table import distant_pairs, lit_table, room_irradiance
 from invrender.colour import AXES
 from invrender.files.images import Photo
 from invrender.rig import Rig
 from invrender.types import Array, Mask
 
-# Logarithm of how many times brighter than the clipping level what is clipped is: mean, standard
-# deviation, and that of the channels about their mean.
-EXCESS, SPREAD, COLOUR = 0.5, 1.0, 0.25
-BRIGHTEST = 6.0  # the greatest such logarithm
-# Standard deviation of the logarithm from block to block, at least: the rounding to 8 bits, too.
-ROUGH = 0.02
 
-
-def clipped_share(photo: Photo, rig: Rig, ball: Ball, height: int) -> Array:
+def clipped_share(photo: Photo, rig: Rig, image: BallImage, height: int) -> Array:
     """(H, 2H, 3): the share of each texel of the environment whose channel is clipped."""
-    area = window(ball)
+    area = image.area
     if photo.clip_level is None or photo.image[area].max() < photo.clip_level:
         return np.zeros((height, 2 * height, 3), np.float32)
     full = np.zeros(photo.image.shape, np.float32)
     full[area] = photo.image[area] >= photo.clip_level
-    share, _ = unfold_environment(Photo(full), rig, ball, height)
+    share, _ = unfold_environment(Photo(full), rig, image, height)
     return np.asarray(share * np.asarray(rig.ball_reflectance), np.float32)
 
 
 def raise_clipped(
-    photo: Photo, rig: Rig, ball: Ball, pattern: Array, gain: Array, environment: Array,
+    photo: Photo, rig: Rig, image: BallImage, pattern: Array, gain: Array, environment: Array,
     coverage: Array,
 ) -> tuple[Array, float]:  # fmt: skip
     """The environment (H, 2H, 3) with its clipped texels raised; and how many times, the mean.
@@ -50,13 +44,13 @@ def raise_clipped(
     papers and shadows have edges, and colour apart from brightness, which varies more. That the
     screen shades the table from the clipped lamps counts too. 1 where nothing is clipped.
     """
-    share = clipped_share(photo, rig, ball, len(environment))
+    share = clipped_share(photo, rig, image, len(environment))
     if not share.any():
         return environment, 1.0
     assert photo.clip_level is not None
     extra = np.asarray(share * photo.clip_level / np.asarray(rig.ball_reflectance), np.float32)
     filled = fill_environment(environment, coverage)
-    seen, at, use, known = lit_table(photo, rig, ball, pattern, gain, filled)
+    seen, at, use, known = lit_table(photo, rig, image.ball, pattern, gain, filled)
     factor = np.exp(_excess(seen, use, known, room_irradiance(rig, at, extra)))
     raised = environment + extra * (factor - 1).astype(np.float32)
     return np.asarray(raised, np.float32), float(factor.mean())
@@ -79,22 +73,23 @@ def _excess(seen: Array, use: Mask, known: Array, extra: Array) -> Array:
 
     def off(x: Array) -> list[Array]:
         light = known + np.expm1(x) * extra
-        return [w - s for w, s in zip(wanted, steps(np.log(np.maximum(light, 1e-12))), strict=True)]
+        return [w - s for w, s in zip(wanted, steps(np.log(np.maximum(light, TINY))), strict=True)]
 
     def residuals(x: Array, scales: list[Array]) -> Array:
-        parts = [np.array([(x.mean() - EXCESS) / SPREAD]), (x - x.mean()) / COLOUR]
+        brightness = (x.mean() - CLIPPED_LAMPS.mean) / CLIPPED_LAMPS.deviation
+        parts = [np.array([brightness]), (x - x.mean()) / CLIPPED_LAMPS.channel_deviation]
         for error, scale, weight in zip(off(x), scales, weights, strict=True):
-            z = error / scale
-            parts.append((weight * np.sign(z) * np.sqrt(np.log1p(z * z))).ravel())
+            parts.append((weight * cauchy_residuals(error / scale)).ravel())
         return np.concatenate(parts)
 
-    x = np.full(3, EXCESS)
+    x = np.full(3, CLIPPED_LAMPS.mean)
+    low, high = CLIPPED_LAMPS.inside, CLIPPED_LAMPS.greatest - CLIPPED_LAMPS.inside
     for turn in range(3):
-        scales = [np.maximum(1.48 * np.median(np.abs(e), 0), ROUGH) for e in off(x)]
+        scales = [np.maximum(spread(e, 0), TABLE_METER.least_spread) for e in off(x)]
         if turn == 0:  # the Cauchy loss has more than one minimum
-            starts = [np.full(3, s) for s in np.linspace(0.05, 4, 10)]
+            starts = [np.full(3, s) for s in np.linspace(*CLIPPED_LAMPS.starts)]
             x = min(starts, key=lambda s: float((residuals(s, scales) ** 2).sum()))
-        bounds = (0, BRIGHTEST)
-        x = optimize.least_squares(residuals, np.clip(x, 1e-6, BRIGHTEST - 1e-6), "3-point",
+        bounds = (0, CLIPPED_LAMPS.greatest)
+        x = optimize.least_squares(residuals, np.clip(x, low, high), "3-point",
                                    bounds, args=(scales,)).x  # fmt: skip
     return np.asarray(x)

@@ -8,11 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from invrender.capture.settings import CROP
 from invrender.files.images import Photo
 from invrender.rig import Rig
 from invrender.types import Array, InputError
-
-MAX_SAMPLES = 8  # of the photo to a pixel of the crop, a side; beyond, the photo is smoothed first
 
 
 def crop_sample(photo: Photo, rig: Rig, size: int = 256) -> Array:
@@ -27,13 +26,13 @@ def crop_sample(photo: Photo, rig: Rig, size: int = 256) -> Array:
     h, w = photo.height, photo.width
     corners = sample_corners(photo, rig)
     low, high = corners.min(0), corners.max(0)
-    x0, y0 = np.maximum(np.floor(low).astype(int) - 8, 0)
-    x1, y1 = np.minimum(np.ceil(high).astype(int) + 8, [w, h])
+    x0, y0 = np.maximum(np.floor(low).astype(int) - CROP.margin, 0)
+    x1, y1 = np.minimum(np.ceil(high).astype(int) + CROP.margin, [w, h])
     crop = photo.image[y0:y1, x0:x1]
     scale = float((high - low).max()) / size  # photo pixels in one of the crop's
-    samples = min(max(1, math.ceil(scale)), MAX_SAMPLES)
+    samples = min(max(1, math.ceil(scale)), CROP.samples)
     wide = 2 * round((scale / samples - 1) / 2) + 1  # odd, so that nothing moves
-    order = 3 if scale < 2 else 1  # the mean over many pixels needs no splines
+    order = 3 if scale < CROP.spline_scale else 1  # the mean over many pixels needs no splines
     pixels = rig.project(rig.sample_points(size * samples, size * samples), h, w)
     at = np.stack([pixels[..., 1] - y0 - 0.5, pixels[..., 0] - x0 - 0.5])
     planes = []
@@ -49,14 +48,14 @@ def crop_sample(photo: Photo, rig: Rig, size: int = 256) -> Array:
 def crop_mask(photo: Photo, rig: Rig, size: int) -> NDArray[np.bool_]:
     """(size, size): pixels of the sample's crop that a saturated photo pixel touches."""
     corners = sample_corners(photo, rig)
-    x0, y0 = np.maximum(np.floor(corners.min(0)).astype(int) - 10, 0)
-    x1, y1 = np.ceil(corners.max(0)).astype(int) + 10
+    x0, y0 = np.maximum(np.floor(corners.min(0)).astype(int) - CROP.mask_margin, 0)
+    x1, y1 = np.ceil(corners.max(0)).astype(int) + CROP.mask_margin
     clipped = photo.clipped
     if not clipped[y0:y1, x0:x1].any():
         return np.zeros((size, size), bool)
     mask = np.zeros((*clipped.shape, 3), np.float32)
     mask[y0:y1, x0:x1] = ndimage.maximum_filter(clipped[y0:y1, x0:x1], 3)[..., None]
-    return crop_sample(Photo(mask), rig, size)[..., 0] > 0.05
+    return crop_sample(Photo(mask), rig, size)[..., 0] > CROP.touched
 
 
 def sample_corners(photo: Photo, rig: Rig) -> Array:
@@ -68,8 +67,8 @@ def sample_corners(photo: Photo, rig: Rig) -> Array:
     corners = rig.project(rig.sample_corners, h, w)
     if not (
         np.isfinite(corners).all()
-        and (corners >= -0.5).all()
-        and (corners <= np.array([w, h]) + 0.5).all()
+        and (corners >= -CROP.tolerance).all()
+        and (corners <= np.array([w, h]) + CROP.tolerance).all()
     ):
         raise InputError("the sample reaches beyond the photo: check the rig's sizes and fov")
     return corners

@@ -10,36 +10,35 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
-from invrender.capture.ball_image import SCREEN_MARGIN, sample_image, screen_mask
-from invrender.capture.mirror import Ball, mirror_normals
+from invrender.capture.ball_image import BallImage, sample_image, screen_mask
+from invrender.capture.mirror import mirror_normals
+from invrender.capture.settings import UNFOLDING
 from invrender.files.images import Photo
 from invrender.rig import Rig
 from invrender.sphere import directions
 from invrender.types import Array, InputError
 
-MARGIN_BLURS = 1.5
-
 
 def unfold_environment(
-    photo: Photo, rig: Rig, ball: Ball, height: int = 128, samples: int = 4, blur: float = 0.0
+    photo: Photo, rig: Rig, image: BallImage, height: int = UNFOLDING.height, blur: float = 0.0
 ) -> tuple[Array, Array]:
     """The environment as the ball shows it: radiance (H, 2H, 3) and coverage (H, 2H) in [0, 1].
 
-    Each texel averages samples² directions; for each the point of the ball that mirrors it into
-    the camera is found and the photo looked up there. Coverage is the share of a texel that is
-    above the horizon and not behind the screen; radiance is the mean over that share. The mirror's
-    reflectance is divided out. ``blur``: the camera's, in pixels; as far as it spreads the screen's
-    light, the room beside it counts as hidden.
+    Each texel averages `UNFOLDING.samples`² directions; for each the point of the ball that mirrors
+    it into the camera is found and the photo looked up there. Coverage is the share of a texel that
+    is above the horizon and not behind the screen; radiance is the mean over that share. The
+    mirror's reflectance is divided out. ``blur``: the camera's, in pixels; as far as it spreads the
+    screen's light, the room beside it counts as hidden.
     """
-    mask, (rows, columns) = screen_mask(rig, ball, SCREEN_MARGIN + MARGIN_BLURS * blur)
-    origin = (rows.start, columns.start)
-    half = height // 2
+    ball, samples, half = image.ball, UNFOLDING.samples, height // 2
+    margin = UNFOLDING.screen_margin + UNFOLDING.margin_a_blur * blur
+    mask = screen_mask(rig, image, margin)
     wanted = directions(samples * height, 2 * samples * height)[: half * samples].astype(float)
     centre = np.asarray(ball.position)
     normal = mirror_normals(rig, centre, ball.radius_m, wanted, False)
     pixels = rig.project(centre + ball.radius_m * normal, *ball.size)
-    free = sample_image(mask, pixels, origin) < 0.01
-    light = sample_image(photo.image[rows, columns], pixels, origin) * free[..., None]
+    free = sample_image(mask, pixels, image.origin) < UNFOLDING.hidden
+    light = sample_image(photo.image[image.area], pixels, image.origin) * free[..., None]
 
     def pool(a: Array) -> Array:
         return a.reshape(half, samples, 2 * height, samples, -1).sum((1, 3))
@@ -67,7 +66,7 @@ def fill_environment(environment: Array, coverage: Array) -> Array:
     if hole.all():
         raise InputError("the mirror ball shows nothing but the screen: check the rig's sizes")
     known = environment[:half][~hole]
-    floor = np.maximum(known.mean(0) * 1e-3, 1e-9)
+    floor = np.maximum(known.mean(0) * UNFOLDING.floor, UNFOLDING.least_floor)
     log = np.log(np.maximum(environment[:half], floor)).reshape(-1, 3).astype(np.float64)
     index = np.full(half * width, -1)
     unknown = np.flatnonzero(hole.reshape(-1))
@@ -80,7 +79,7 @@ def fill_environment(environment: Array, coverage: Array) -> Array:
     neighbours = [
         (r, (c - 1) % width, step_v / (step_u * sine[r])),
         (r, (c + 1) % width, step_v / (step_u * sine[r])),
-        (r - 1, c, side_up[r] * step_u / step_v),  # nought at the zenith
+        (r - 1, c, side_up[r] * step_u / step_v),  # zero at the zenith
         (r + 1, c, np.where(r + 1 < half, side_up[r + 1] * step_u / step_v, 0)),
     ]
     diagonal = np.zeros(unknown.size)

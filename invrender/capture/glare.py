@@ -8,70 +8,75 @@ from dataclasses import replace
 import numpy as np
 from scipy import optimize
 
-from invrender.capture.ball_image import BARE, pixel_grid, sample_image, trace_ball, window
-from invrender.capture.mirror import Ball
+from invrender.capture.ball_image import BallImage, sample_image
+from invrender.capture.robust import spread
+from invrender.capture.settings import GLARE_FIT
 from invrender.files.images import Photo
 from invrender.rig import Rig
 from invrender.types import Array
 
-VEILED = 0.7  # what it must leave of the residuals' cost to be believed
 
-
-def lift_veil(photo: Photo, rig: Rig, ball: Ball) -> Photo:
+def remove_glare(photo: Photo, rig: Rig, image: BallImage) -> Photo:
     """The photo without the glare that veils a part of the ball, if there is one.
 
-    Between horizon and outline the ball mirrors the table, which the photo shows as well: what it
-    shows more than that, over and over, is no image. That is fitted by a Gaussian in the photo with
-    a colour of its own (least squares with Cauchy's loss), and taken from the whole ball where it
-    explains the difference. A veil that ends before the horizon stays unseen.
+    Between horizon and outline the ball mirrors the table, which the photo shows as well: what the
+    ball shows more than that is glare. It is fitted by a Gaussian in the photo with a colour of its
+    own (least squares with Cauchy's loss), and subtracted from the whole ball where it explains the
+    difference. Glare that ends before the horizon is not found.
     """
-    area = rows, columns = window(ball)
-    pixels = pixel_grid(rows, columns)
-    point, mirrored, seen = trace_ball(rig, ball, pixels)
-    table = point - mirrored * (point[..., 2:] / np.minimum(mirrored[..., 2:], -1e-3))
+    ball, area = image.ball, image.area
+    point, mirrored = image.point, image.mirrored
+    down = np.minimum(mirrored[..., 2:], -GLARE_FIT.least_downward)
+    table = point - mirrored * (point[..., 2:] / down)
     at = rig.project(table, *ball.size)
     far = np.linalg.norm((table - np.asarray(ball.position))[..., :2], axis=-1)
-    use = seen & (mirrored[..., 2] < -0.02) & (far > BARE * ball.radius_m)
+    use = image.visible & (mirrored[..., 2] < -GLARE_FIT.downward)
+    use &= far > GLARE_FIT.bare * ball.radius_m
     use &= (at > 1).all(-1) & (at < np.array(ball.size[::-1]) - 1).all(-1)
-    # The sample may shine, and so look different from there.
-    use &= ~(np.abs(table[..., :2]) < 0.51 * rig.sample_size).all(-1) & ~photo.clipped[area]
-    mirror = np.asarray(rig.ball_reflectance)
-    extra = photo.image[area][use] - mirror * sample_image(photo.image, at[use])
-    spread = 1.48 * float(np.median(np.abs(extra))) if use.any() else 0.0
-    if not spread > 0:
+    # The sample may shine, and so look different from the ball.
+    use &= ~(np.abs(table[..., :2]) < GLARE_FIT.sample * rig.sample_size).all(-1)
+    use &= ~photo.clipped[area]
+    reflectance = np.asarray(rig.ball_reflectance)
+    extra = photo.image[area][use] - reflectance * sample_image(photo.image, at[use])
+    scale = float(spread(extra)) if use.any() else 0.0
+    if not scale > 0:
         return photo
-    inside, outside = ((p - ball.centre) / ball.radius for p in (pixels, at[use]))
+    inside, outside = ((p - ball.centre) / ball.radius for p in (image.pixels, at[use]))
 
-    def veil(p: Array, place: Array) -> Array:
+    def glare(p: Array, place: Array) -> Array:
         return np.asarray(np.exp(-((place - p[:2]) ** 2).sum(-1) / p[2] ** 2)[..., None] * p[3:])
 
-    def off(p: Array) -> Array:
-        seen = veil(p, inside[use]) - mirror * veil(p, outside)
-        return np.asarray((seen - extra / spread).ravel())
+    def residuals(p: Array) -> Array:
+        expected = glare(p, inside[use]) - reflectance * glare(p, outside)
+        return np.asarray((expected - extra / scale).ravel())
 
     def cost(p: Array) -> float:
-        return float(np.log1p(off(p) ** 2).sum())
+        return float(np.log1p(residuals(p) ** 2).sum())
 
     starts = []
-    for angle in np.arange(12) * (math.pi / 6):
-        start = np.array([math.cos(angle), math.sin(angle), 0.4, 0, 0, 0])
-        near = ((inside[use] - start[:2]) ** 2).sum(-1) < 0.4**2
+    width = GLARE_FIT.start_width
+    for angle in np.arange(GLARE_FIT.directions) * (2 * math.pi / GLARE_FIT.directions):
+        start = np.array([math.cos(angle), math.sin(angle), width, 0, 0, 0])
+        near = ((inside[use] - start[:2]) ** 2).sum(-1) < width**2
         if near.any():
-            start[3:] = np.maximum(np.median(extra[near], 0) / spread, 0)
+            start[3:] = np.maximum(np.median(extra[near], 0) / scale, 0)
             starts.append(start)
     if not starts:
         return photo
-    bounds = [-2, -2, 0.1, 0, 0, 0], [2, 2, 1, np.inf, np.inf, np.inf]
+    least, most = GLARE_FIT.widths
+    reach = GLARE_FIT.farthest
+    bounds = [-reach, -reach, least, 0, 0, 0], [reach, reach, most, np.inf, np.inf, np.inf]
     start = min(starts, key=cost)
-    p = optimize.least_squares(off, start, bounds=bounds, loss="cauchy", ftol=1e-6).x
-    strength = veil(p, inside).sum(-1)
-    # Nor is it believed where it would be stronger than anywhere it can be seen.
-    sky = seen & (mirrored[..., 2] > 0)
-    if not cost(p) < VEILED * cost(p * [1, 1, 1, 0, 0, 0]) or (
-        strength[sky].max(initial=0) > strength[use].max()
+    p = optimize.least_squares(
+        residuals, start, bounds=bounds, loss="cauchy", ftol=GLARE_FIT.precision
+    ).x
+    strength = glare(p, inside).sum(-1)
+    # Glare that would be stronger over the sky than anywhere it was measured is not believed.
+    if not cost(p) < GLARE_FIT.cost_ratio * cost(p * [1, 1, 1, 0, 0, 0]) or (
+        strength[image.sky].max(initial=0) > strength[use].max()
     ):
         return photo
-    image = photo.image.copy()
-    lifted = np.maximum(image[area] - veil(p, inside) * spread, 0)
-    image[area] = np.where(photo.clipped[area][..., None], image[area], lifted)
-    return replace(photo, image=image)
+    result = photo.image.copy()
+    clean = np.maximum(result[area] - glare(p, inside) * scale, 0)
+    result[area] = np.where(photo.clipped[area][..., None], result[area], clean)
+    return replace(photo, image=result)

@@ -2,56 +2,45 @@
 
 Behind the screen the room is only filled smoothly. But the screen hides less of it from the table
 and the sample than from the ball, and a lamp there lights what the screen does not shade. Where the
-table's shading is plainly better explained so, one part of the filling is made that bright.
+table's shading is clearly better explained so, one part of the filling is made that bright.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 from scipy import optimize
 
 from invrender.capture.ball_image import screen_coordinates
-from invrender.capture.clipped_lamps import ROUGH
 from invrender.capture.mirror import Ball
+from invrender.capture.robust import cauchy_residuals, spread
+from invrender.capture.settings import HIDDEN_LAMP, TABLE_METER, TINY
 from invrender.capture.table import distant_pairs, hidden_by_screen, lit_table
 from invrender.colour import AXES
 from invrender.files.images import Photo
 from invrender.rig import Rig
 from invrender.sphere import directions, sky_flux
-from invrender.types import Array
-
-PARTS = 8  # of what the screen hides from the ball, a side
-TILE = 16  # blocks a side, over which the errors' correlation is measured
-# Of the logarithm of how many times brighter a part is than its filling: half the range between the
-# quartiles, of a Cauchy distribution, and the channels' standard deviation about their mean. In
-# rooms one part in a hundred has 3 to 5: a lamp.
-BRIGHTER, COLOUR = 0.3, 0.12
-BRIGHTEST = 9.0  # the greatest such logarithm
-LAMPS = (0.1, 0.4, 1.5)  # of the table's light: of a lamp to start from
-WORTH = 6.0  # by how much, twice the log posterior, it must be likelier with a lamp
-LEFT = 0.82  # of the table's usual differences in brightness, what a lamp must leave unexplained
+from invrender.types import Array, Mask
 
 
 def add_hidden_lamp(
     photo: Photo, rig: Rig, ball: Ball, pattern: Array, gain: Array, environment: Array,
     coverage: Array,
 ) -> tuple[Array, float]:  # fmt: skip
-    """The filled environment (H, 2H, 3) with the lamp behind the screen that the table tells of;
-    and how many times as bright as the filling that is (1 where there is none).
+    """The filled environment (H, 2H, 3) with the lamp behind the screen that the table's shading
+    shows; and how many times as bright as the filling that is (1 where there is none).
 
-    The screen's radiance is pattern (h, w, 3) times gain (3,). In a JPEG none is looked for: its
+    The screen's radiance is pattern (h, w, 3) times gain (3,). In a JPEG no lamp is looked for: its
     colours are too coarse.
     """
     if photo.clip_level is not None:
         return environment, 1.0
-    height = len(coverage)
+    height, parts = len(coverage), HIDDEN_LAMP.parts
     d = directions(height, 2 * height).astype(float)
     s, t, _ = screen_coordinates(rig, np.asarray(ball.position), d)
-    row, column = (np.clip(np.nan_to_num(a) * PARTS, 0, PARTS - 1).astype(int) for a in (t, s))
-    part = np.where((coverage <= 0) & (d[..., 2] > 0), row * PARTS + column, -1)
+    row, column = (np.clip(np.nan_to_num(a) * parts, 0, parts - 1).astype(int) for a in (t, s))
+    part = np.where((coverage <= 0) & (d[..., 2] > 0), row * parts + column, -1)
     seen, at, use, known = lit_table(photo, rig, ball, pattern, gain, environment)
     shading = _Shading(seen, use, known)
     best = None
@@ -63,9 +52,10 @@ def add_hidden_lamp(
     if best is None:
         return environment, 1.0
     _, k, light, x = best
-    x = shading.descend(x, light)
+    x = shading.minimise(x, light)
     gained = shading.cost(np.zeros(3), light) - shading.cost(x, light)
-    if gained < WORTH or shading.left(x, light) > LEFT:
+    unexplained = shading.spread_ratio(x, light)
+    if gained < HIDDEN_LAMP.gain or unexplained > HIDDEN_LAMP.spread_ratio:
         return environment, 1.0
     factor = np.where((part == k)[..., None], np.exp(x), 1)
     return np.asarray(environment * factor, np.float32), float(np.exp(x).mean())
@@ -77,7 +67,7 @@ def _part_lights(rig: Rig, at: Array, environment: Array, part: Array) -> Iterat
     label = part[: len(part) // 2].ravel()
     behind = np.flatnonzero(label >= 0)
     seen = ~hidden_by_screen(rig, at, d[behind])
-    for k in range(PARTS**2):
+    for k in range(HIDDEN_LAMP.parts**2):
         own = label[behind] == k
         yield seen[:, own] @ flux[behind[own]]
 
@@ -93,29 +83,32 @@ class _Shading:
     Varin, Reid, Firth 2011).
     """
 
-    def __init__(self, seen: Array, use: Any, known: Array) -> None:
+    def __init__(self, seen: Array, use: Mask, known: Array) -> None:
         self.seen, self.known = seen @ AXES, known
         self.pairs = [pair for pair, _ in distant_pairs(use)]
-        tile = np.add.outer(np.arange(len(use)) // TILE * 1000, np.arange(use.shape[1]) // TILE)
+        down, across = (np.arange(n) // HIDDEN_LAMP.tile for n in use.shape)
+        tile = np.add.outer(down * (across.max(initial=0) + 1), across)
         self.weights = []
         for (i, _), error in zip(self.pairs, self.errors(known), strict=True):
-            spread = _spread(error)
+            scale = spread(error, 0)
             index = np.unique(tile[use][i], return_inverse=True)[1]
-            # What is rounded is white, a usual error's pull 0.36.
-            white = len(i) * 0.13 * (1 - np.minimum(spread / ROUGH, 1) ** 2)
-            z = error / np.maximum(spread, ROUGH)
+            # What is rounded to 8 bits has independent errors of that spread.
+            rounded = np.minimum(scale / TABLE_METER.least_spread, 1) ** 2
+            white = len(i) * HIDDEN_LAMP.white_pull * (1 - rounded)
+            z = error / np.maximum(scale, TABLE_METER.least_spread)
             pull = z / (1 + z * z)
             pull -= pull.mean(0)
             sums = np.stack([np.bincount(index, p) for p in pull.T], -1)
-            alike = ((sums**2).sum(0) + white) / ((pull**2).sum(0) + white + 1e-12)
+            alike = ((sums**2).sum(0) + white) / ((pull**2).sum(0) + white + TINY)
             self.weights.append(1 / np.maximum(alike, 1) * 2 / len(self.pairs))
 
     def errors(self, light: Array) -> list[Array]:
         """Differences (pairs, 3), along `AXES`, of each lag."""
-        rest = self.seen - np.log(np.maximum(light, 1e-12)) @ AXES
-        return [rest[i] - rest[j] for i, j in self.pairs]
+        albedo = self.seen - np.log(np.maximum(light, TINY)) @ AXES
+        return [albedo[i] - albedo[j] for i, j in self.pairs]
 
     def lit(self, x: Array, lamp: Array) -> Array:
+        """Irradiance (n, 3) with a part of the room exp(x) times as bright."""
         return np.asarray(self.known + np.expm1(x) * lamp)
 
     def starts(self, lamp: Array) -> list[Array]:
@@ -123,47 +116,48 @@ class _Shading:
         most = lamp.max(initial=0)
         if not self.pairs or not most > 0:
             return []
-        shares = np.array(LAMPS) * np.median(self.known) / most
-        return [np.full(3, min(x, BRIGHTEST - 1e-3)) for x in np.log1p(shares)]
+        shares = np.array(HIDDEN_LAMP.starts) * np.median(self.known) / most
+        greatest = HIDDEN_LAMP.greatest - HIDDEN_LAMP.inside
+        return [np.full(3, min(x, greatest)) for x in np.log1p(shares)]
 
     def cost(self, x: Array, lamp: Array) -> float:
         """Minus twice the logarithm of the posterior, but for a constant."""
         cost = float((_prior(x) ** 2).sum())
         for error, weight in zip(self.errors(self.lit(x, lamp)), self.weights, strict=True):
-            spread = np.maximum(_spread(error), ROUGH)
-            cost += float((weight * (np.log(spread) + np.log1p((error / spread) ** 2))).sum())
+            scale = np.maximum(spread(error, 0), TABLE_METER.least_spread)
+            cost += float((weight * (np.log(scale) + np.log1p((error / scale) ** 2))).sum())
         return cost
 
-    def left(self, x: Array, lamp: Array) -> float:
+    def spread_ratio(self, x: Array, lamp: Array) -> float:
         """The errors' spread in brightness with the lamp over that without, the median lag's."""
         with_lamp, without = (
-            [np.maximum(_spread(e), ROUGH)[0] for e in self.errors(light)]
+            [max(spread(e, 0)[0], TABLE_METER.least_spread) for e in self.errors(light)]
             for light in (self.lit(x, lamp), self.known)
         )
         return float(np.median(np.divide(with_lamp, without)))
 
-    def descend(self, x: Array, lamp: Array) -> Array:
+    def minimise(self, x: Array, lamp: Array) -> Array:
         """The most probable logarithms near ``x``."""
         for _ in range(3):
-            spreads = [np.maximum(_spread(e), ROUGH) for e in self.errors(self.lit(x, lamp))]
+            scales = [
+                np.maximum(spread(e, 0), TABLE_METER.least_spread)
+                for e in self.errors(self.lit(x, lamp))
+            ]
 
-            def residuals(x: Array, spreads: list[Array] = spreads) -> Array:
+            def residuals(x: Array, scales: list[Array] = scales) -> Array:
                 parts = [_prior(x)]
                 errors = self.errors(self.lit(x, lamp))
-                for error, spread, weight in zip(errors, spreads, self.weights, strict=True):
-                    z = error / spread
-                    parts.append((np.sign(z) * np.sqrt(weight * np.log1p(z * z))).ravel())
+                for error, scale, weight in zip(errors, scales, self.weights, strict=True):
+                    parts.append((np.sqrt(weight) * cauchy_residuals(error / scale)).ravel())
                 return np.concatenate(parts)
 
-            x = optimize.least_squares(residuals, x, "3-point", (0, BRIGHTEST), max_nfev=20).x
+            bounds = (0, HIDDEN_LAMP.greatest)
+            x = optimize.least_squares(residuals, x, "3-point", bounds, max_nfev=20).x
         return np.asarray(x)
-
-
-def _spread(error: Array) -> Array:
-    return np.asarray(1.48 * np.median(np.abs(error), 0))
 
 
 def _prior(x: Array) -> Array:
     """Residuals (4,) whose squares are minus twice the log prior."""
     grey = x.mean()
-    return np.array([np.sqrt(2 * np.log1p((grey / BRIGHTER) ** 2)), *((x - grey) / COLOUR)])
+    brightness = np.sqrt(2 * np.log1p((grey / HIDDEN_LAMP.quartile) ** 2))
+    return np.array([brightness, *((x - grey) / HIDDEN_LAMP.channel_deviation)])

@@ -4,7 +4,7 @@ The known pattern is registered with the ball's image: the screen's shift and ti
 curve (a gamma a channel), its gain and the camera's blur are fitted together, by Levenberg's and
 Marquardt's steps from coarse to fine. Each pixel is compared with what it should average of the
 pattern. Pixels on the screen's edge hold a share of the room beside it; the more, the less certain
-they are. An 8-bit file's colours are blurred more than its luma, by as much as fits.
+they are. An 8-bit file's colours are blurred more than its luma; how much is fitted.
 """
 
 from __future__ import annotations
@@ -16,29 +16,13 @@ import numpy as np
 from scipy import ndimage, special
 from scipy.spatial.transform import Rotation
 
-from invrender.capture.ball_image import pixel_grid, screen_coordinates, trace_ball, window
-from invrender.capture.mirror import Ball
+from invrender.capture.ball_image import BallImage, screen_coordinates, trace_ball
+from invrender.capture.robust import spread as robust_spread
+from invrender.capture.settings import JPEG_GAMMA, JPEG_LUMA, SCREEN_FIT, TINY
 from invrender.files.images import Photo
 from invrender.rig import Rig
 from invrender.sampling import resize_pattern
 from invrender.types import Array, InputError
-
-SHIFT_PRIOR = 6e-3 / 0.09  # standard deviation of the screen's shift, in sizes of the sample
-TILT_PRIOR = 6.0  # of its tilt, degrees
-GAMMA_PRIOR, CHANNEL_PRIOR = 0.5, 0.03  # of log gamma, and of the channels' differences in it
-USUAL_BLUR, BLUR_PRIOR = 0.5, 0.7  # pixels; standard deviation of its logarithm
-COLOUR_BLUR = 0.9  # the same, of colours in a JPEG at half the resolution
-LUMA, CURVE = np.array([0.299, 0.587, 0.114]), 2.2  # a JPEG's, about
-FINEST = 100.0  # a ball of more pixels in radius is shrunk for the fit
-CELLS = 128  # of the pattern in the fit
-POOR = 0.01  # residual of the screen as it should be from which it is in doubt
-WORTH = 50.0  # of half a chi-squared, by which another pose or curve must be likelier
-SATURATED = 0.01  # share of saturated pixels from which it is told, and the screen fitted with care
-NO_CURVE = 0.2  # share of saturated pixels from which gain and gamma cannot be told apart
-# Pixels of blur through which the screen is looked for, and what of the cost a step must gain.
-# Through the greatest blur the room behind the screen is vague: a few steps, and it is told anew.
-STAGES = ((2.5, 0.03), (2.5, 0.03), (1.0, 1e-2), (0.0, 1e-3), (0.0, 1e-6))
-EDGE = 3  # pixels outside the screen's image that are compared as well
 
 
 @dataclass(frozen=True)
@@ -65,60 +49,63 @@ class Screen:
     saturated: float
 
 
-def fit_screen(photo: Photo, rig: Rig, ball: Ball, pattern: Array) -> Screen:
+def fit_screen(photo: Photo, rig: Rig, image: BallImage, pattern: Array) -> Screen:
     """Register the ``pattern`` (h, w, 3), relative radiance, with the ball's image of the screen.
 
-    Gain and blur first, for the screen as it should be. Where that fits worse than to `POOR`, or
-    the screen is saturated, its pose and the display's curve are fitted too; where more than
-    `NO_CURVE` is saturated the curve cannot be told from the gain and is taken as straight. Raises
-    `InputError` if the ball cannot show the screen, or shows it saturated or dark.
+    Gain and blur are fitted first, for the screen as it should be. Where that fits worse than to
+    `SCREEN_FIT.poor`, or the screen is saturated, its pose and the display's curve are fitted too;
+    where more than `SCREEN_FIT.no_curve` is saturated the curve cannot be told from the gain and is
+    taken as straight. Raises `InputError` if the ball cannot show the screen, or shows it saturated
+    or dark.
     """
-    fit = _Fit(photo, rig, ball, pattern)
+    fit = _Fit(photo, rig, image, pattern)
     u = fit.start()
-    for stage in STAGES[-2:]:
+    for stage in SCREEN_FIT.stages[-2:]:
         u = fit.solve(u, *stage)
     ideal = fit.result(u)
-    if ideal.residual < POOR and ideal.saturated < SATURATED:
+    if ideal.residual < SCREEN_FIT.poor and ideal.saturated < SCREEN_FIT.saturated:
         return ideal
     fit.free[:_COLOUR] = True
-    fit.free[_GAMMA] = ideal.saturated < NO_CURVE
+    fit.free[_GAMMA] = ideal.saturated < SCREEN_FIT.no_curve
     start = u
     for first in (0, 2):  # if the greatest blur leads astray, without it
         u = fit.start()
-        for blurred, least in STAGES[first:]:
-            u = fit.solve(u, blurred * max(1.0, fit.radius / 60), least)
-        better = fit.cost(start) - fit.cost(u) > WORTH
+        for blurred, least in SCREEN_FIT.stages[first:]:
+            u = fit.solve(u, blurred * max(1.0, fit.radius / SCREEN_FIT.stage_radius), least)
+        better = fit.cost(start) - fit.cost(u) > SCREEN_FIT.better
         if better:
             break
     # A saturated pixel had at least so much light, which the ideal screen alone may not explain.
-    if better or ideal.saturated > SATURATED:
+    if better or ideal.saturated > SCREEN_FIT.saturated:
         return replace(fit.result(u), ideal_residual=ideal.residual)
     return ideal
 
 
 # Places of the unknowns: shift and tilt in units of their priors, log gamma and log gain a channel,
-# log blur in pixels, and log of what an 8-bit file's colours are blurred more.
+# log blur in pixels, and the log of the further blur of an 8-bit file's colours.
 _SHIFT, _TILT, _GAMMA, _GAIN, _BLUR, _COLOUR = (
     slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), 12, 13,
 )  # fmt: skip
 _COUNT = 14
-_STEP = 0.02  # of finite differences
-ROBUST = 2.5  # deviations from which an error counts less
 
 
 def _cover(s: Array) -> tuple[Array, Array]:
     """Share of each sub-pixel (h, w, n, n) whose coordinate lies in [0, 1]; its derivative."""
     across = np.abs(s[:, :, :, -1:] - s[:, :, :, :1]) + np.abs(s[:, :, -1:] - s[:, :, :1])
-    width = np.maximum(across / (s.shape[3] - 1), 1e-6)
+    width = np.maximum(across / (s.shape[3] - 1), SCREEN_FIT.least_width)
     cover = 0.5 + (0.5 - abs(s - 0.5)) / width
     slope = np.where((cover > 0) & (cover < 1), -np.sign(s - 0.5) / width, 0)
     return np.clip(cover, 0, 1), slope
 
 
 def _look_up(image: Array, s: Array, t: Array, slopes: bool) -> list[Array]:
-    """Bilinear look-ups (..., 3) in (n, n, 3), row 0 at t = 1; their derivatives by s and t."""
+    """Bilinear look-ups (..., 3) in (n, n, 3), row 0 at t = 1; their derivatives by s and t.
+
+    Written by hand for the derivatives, which `scipy.ndimage` does not give.
+    """
     n = len(image)
-    x, y = (np.clip(q * n - 0.5, 0, n - 1.001) for q in (s, 1 - t))
+    last = n - SCREEN_FIT.last_cell
+    x, y = (np.clip(q * n - 0.5, 0, last) for q in (s, 1 - t))
     i, j = y.astype(int), x.astype(int)
     fy, fx = (y - i)[..., None], (x - j)[..., None]
     flat, k = image.reshape(n * n, 3), i * n + j
@@ -127,7 +114,7 @@ def _look_up(image: Array, s: Array, t: Array, slopes: bool) -> list[Array]:
     out = [top + fy * (bottom - top)]
     if slopes:
         right = [b - a for a, b in (corners[:2], corners[2:])]
-        inside = [((q > 0) & (q < n - 1.001))[..., None] * n for q in (x, y)]
+        inside = [((q > 0) & (q < last))[..., None] * n for q in (x, y)]
         out += [(right[0] + fy * (right[1] - right[0])) * inside[0], (top - bottom) * inside[1]]
     return out
 
@@ -149,15 +136,16 @@ def _blur(image: Array, sigma: float) -> Array:
 class _Fit:
     """The ball's image around the screen, the rays that its sub-pixels see, and the fit's steps."""
 
-    def __init__(self, photo: Photo, rig: Rig, ball: Ball, pattern: Array) -> None:
+    def __init__(self, photo: Photo, rig: Rig, image: BallImage, pattern: Array) -> None:
         self.rig, self.full = rig, pattern
         self.free = np.zeros(_COUNT, bool)
         self.free[_GAIN], self.free[_BLUR] = True, True
         self.free[_COLOUR] = self.coded = photo.clip_level is not None
-        self.step = step = max(1, round(ball.radius / FINEST))
+        ball = image.ball
+        self.step = step = max(1, round(ball.radius / SCREEN_FIT.finest))
         self.radius = ball.radius / step
-        n = 4 if self.radius < 50 else 3 if self.radius < 80 else 2
-        rows, columns = self._area(rig, ball, step)
+        n = next(count for radius, count in SCREEN_FIT.sub_pixels if self.radius < radius)
+        rows, columns = self._area(rig, image, step)
         area = photo.image[rows, columns]
         h, w = area.shape[0] // step, area.shape[1] // step
         pool = area[: h * step, : w * step].reshape(h, step, w, step, 3)
@@ -172,15 +160,19 @@ class _Fit:
         x = columns.start + step * np.arange(w)[:, None, None] + at
         point, mirrored, seen = trace_ball(rig, ball, np.stack(np.broadcast_arrays(x, y), -1))
         self.lines = np.concatenate([np.cross(point, mirrored), mirrored], -1)
-        self.seen = seen & (mirrored[..., 2] > 0.02)
-        # Float64: descent is told from noise by the last digits.
-        coarse = resize_pattern(pattern, min(CELLS, len(pattern)))
-        self.pattern = np.maximum(coarse.astype(float), 1e-3)
-        self.usual = np.zeros(_COUNT)
-        self.usual[_BLUR], self.usual[_COLOUR] = np.log([USUAL_BLUR, COLOUR_BLUR / step])
-        self.prior = np.diag([*np.ones(6), *np.zeros(6), *np.full(2, 1 / BLUR_PRIOR**2)])
+        self.seen = seen & (mirrored[..., 2] > SCREEN_FIT.upward[0])
+        # In double precision: near the minimum a step's gain shows in the last digits only.
+        coarse = resize_pattern(pattern, min(SCREEN_FIT.cells, len(pattern)))
+        self.pattern = np.maximum(coarse.astype(float), SCREEN_FIT.least_pattern)
+        self.prior_mean = np.zeros(_COUNT)
+        self.prior_mean[_BLUR] = math.log(SCREEN_FIT.expected_blur)
+        self.prior_mean[_COLOUR] = math.log(SCREEN_FIT.colour_blur / step)
+        blurs = np.full(2, 1 / SCREEN_FIT.blur_deviation**2)
+        self.prior = np.diag([*np.ones(6), *np.zeros(6), *blurs])
         apart = np.eye(3) - 1 / 3
-        self.prior[_GAMMA, _GAMMA] = apart / CHANNEL_PRIOR**2 + 1 / 9 / GAMMA_PRIOR**2
+        self.prior[_GAMMA, _GAMMA] = (
+            apart / SCREEN_FIT.channel_deviation**2 + 1 / 9 / SCREEN_FIT.gamma_deviation**2
+        )
         self.focus(0.0)
 
     def focus(self, blurred: float) -> None:
@@ -191,30 +183,29 @@ class _Fit:
             self.clipped = ndimage.maximum_filter(self.saturated, (3, 3, 1))
 
     @staticmethod
-    def _area(rig: Rig, ball: Ball, step: int) -> tuple[slice, slice]:
+    def _area(rig: Rig, image: BallImage, step: int) -> tuple[slice, slice]:
         """Rows and columns of the photo that may show the screen, wherever it hangs."""
-        rows, columns = window(ball)
-        coarse = max(1, round(ball.radius / 40))
-        pixels = pixel_grid(rows, columns)[coarse // 2 :: coarse, coarse // 2 :: coarse]
-        point, mirrored, seen = trace_ball(rig, ball, pixels)
-        s, t, _ = screen_coordinates(rig, point, mirrored)
+        rows, columns, radius = image.rows, image.columns, image.ball.radius
+        s, t, _ = screen_coordinates(rig, image.point, image.mirrored)
+        reach = SCREEN_FIT.near
+        near = image.visible & (image.mirrored[..., 2] > SCREEN_FIT.upward[1])
         with np.errstate(invalid="ignore"):
-            near = seen & (mirrored[..., 2] > 0.05) & (abs(s - 0.5) < 0.75) & (abs(t - 0.5) < 0.75)
+            near &= (abs(s - 0.5) < reach) & (abs(t - 0.5) < reach)
         if not near.any():
             raise InputError("the ball cannot show the screen: check the rig's sizes")
         y, x = np.nonzero(near)
-        margin = math.ceil(0.06 * ball.radius) + (EDGE + 4) * step
+        margin = math.ceil(SCREEN_FIT.window_margin * radius) + (SCREEN_FIT.edge + 4) * step
         return (
-            slice(max(rows.start, rows.start + coarse * y.min() - margin),
-                  min(rows.stop, rows.start + coarse * (y.max() + 1) + margin)),
-            slice(max(columns.start, columns.start + coarse * x.min() - margin),
-                  min(columns.stop, columns.start + coarse * (x.max() + 1) + margin)),
+            slice(max(rows.start, rows.start + y.min() - margin),
+                  min(rows.stop, rows.start + y.max() + 1 + margin)),
+            slice(max(columns.start, columns.start + x.min() - margin),
+                  min(columns.stop, columns.start + x.max() + 1 + margin)),
         )  # fmt: skip
 
     def moved(self, u: Array) -> Rig:
         """The rig with the screen where ``u`` puts it."""
-        shift = u[_SHIFT] * SHIFT_PRIOR * self.rig.sample_size
-        tilt = u[_TILT] * TILT_PRIOR
+        shift = u[_SHIFT] * SCREEN_FIT.shift_deviation * self.rig.sample_size
+        tilt = u[_TILT] * SCREEN_FIT.tilt_deviation
         return replace(
             self.rig,
             screen_shift=tuple(np.add(self.rig.screen_shift, shift)),
@@ -233,12 +224,12 @@ class _Fit:
 
     def screen(self, u: Array) -> tuple[Array, Array, Array]:
         """The screen's sides and corner as `moved` has them, (..., 3) each."""
-        tilt = np.asarray(u[..., _TILT] * TILT_PRIOR + self.rig.screen_tilt)
+        tilt = np.asarray(u[..., _TILT] * SCREEN_FIT.tilt_deviation + self.rig.screen_tilt)
         turn = Rotation.from_rotvec(tilt.reshape(-1, 3), degrees=True).as_matrix()
         sides = self.rig.screen_size * turn.reshape(*tilt.shape, 3)
         e_x, e_y = sides[..., 0], sides[..., 1]
         level = sum(self.rig.screen_edges) / 2 + self.rig.screen_corner
-        middle = level + u[..., _SHIFT] * SHIFT_PRIOR * self.rig.sample_size
+        middle = level + u[..., _SHIFT] * SCREEN_FIT.shift_deviation * self.rig.sample_size
         return e_x, e_y, middle - (e_x + e_y) / 2
 
     def look(self, u: Array, slopes: bool = False) -> Array:
@@ -269,7 +260,8 @@ class _Fit:
                 for d, e in zip(by_place, edges, strict=True)
             )
             if self.free[0]:
-                change = (self.forms(u + _STEP * np.eye(6, _COUNT)) - forms) / _STEP
+                step = SCREEN_FIT.difference
+                change = (self.forms(u + step * np.eye(6, _COUNT)) - forms) / step
                 moved = self.lines[on] @ np.concatenate(list(change), -1)
                 for da, db, dc in np.moveaxis(moved, -1, 0).reshape(6, 3, *s.shape):
                     ds, dt = (((d - q * dc) / c)[..., None] for d, q in ((da, s), (db, t)))
@@ -283,19 +275,20 @@ class _Fit:
 
     def blur(self, out: Array, u: Array, slope: bool) -> Array:
         """Images (n, H, W, 4) blurred as the camera does; last, if asked for, the slope by that."""
-        sigma, wider = (math.hypot(math.exp(u[_BLUR] + d), self.blurred) for d in (0, _STEP))
+        step = SCREEN_FIT.difference
+        sigma, wider = (math.hypot(math.exp(u[_BLUR] + d), self.blurred) for d in (0, step))
         blurred = _blur(out, sigma)
         if not slope:
             return np.asarray(blurred)
         more = _blur(out[:1], wider)
-        return np.concatenate([blurred, (more - blurred[:1]) / _STEP])
+        return np.concatenate([blurred, (more - blurred[:1]) / step])
 
     def start(self) -> Array:
         """The nominal pose, a straight curve and the gain that fits them best."""
-        u = self.usual.copy()
+        u = self.prior_mean.copy()
         seen = self.look(u)[0]
-        inside = seen[..., 3] > 0.98
-        if inside.sum() < 12:
+        inside = seen[..., 3] > SCREEN_FIT.inside
+        if inside.sum() < SCREEN_FIT.least_inside:
             raise InputError(
                 "the ball's image shows too little of the screen: check the rig's sizes"
             )
@@ -307,17 +300,18 @@ class _Fit:
 
     def background(self, image: Array, share: Array) -> tuple[Array, Array]:
         """The room's radiance (H, W, 3) continued behind the screen, and how much it varies."""
-        margin = 2 + EDGE / 2 + 2 * self.blurred
-        room = ndimage.distance_transform_edt(share < 0.003) > margin
+        margin = SCREEN_FIT.room_margin * (1 + self.blurred) + SCREEN_FIT.edge / 2
+        room = ndimage.distance_transform_edt(share < SCREEN_FIT.outside) > margin
         if not room.any():
             level = np.broadcast_to(np.median(image, (0, 1)), image.shape)
             return level, level
-        weight = ndimage.uniform_filter(room.astype(np.float32), 5) + 1e-6
+        size = SCREEN_FIT.room_window
+        weight = ndimage.uniform_filter(room.astype(np.float32), size) + SCREEN_FIT.least_share
         mean, square = (
-            ndimage.uniform_filter(a * room[..., None], (5, 5, 1)) / weight[..., None]
+            ndimage.uniform_filter(a * room[..., None], (size, size, 1)) / weight[..., None]
             for a in (image, image * image)
         )
-        spread = np.sqrt(np.maximum(square - mean * mean, 0)) + 0.1 * mean
+        spread = np.sqrt(np.maximum(square - mean * mean, 0)) + SCREEN_FIT.room_spread * mean
         y, x = ndimage.distance_transform_edt(~room, return_distances=False, return_indices=True)
         return image[y, x], spread[y, x]
 
@@ -328,17 +322,17 @@ class _Fit:
         errors' deviations and the room behind the screen, is as ``u`` has it.
         """
         self.focus(blurred)
-        self.suppose(u)
+        self.prepare(u)
         cost = self.cost(u)
         damping = 1e-3
-        for _ in range(60):
+        for _ in range(SCREEN_FIT.steps):
             matrix, right = self.normal_equations(u)
             eased = damping / 8
             for _ in range(6):
-                damped = matrix + np.diag(np.diag(matrix) * damping + 1e-9)
+                damped = matrix + np.diag(np.diag(matrix) * damping + SCREEN_FIT.ridge)
                 step = np.zeros(_COUNT)
                 step[self.free] = np.linalg.solve(damped, right)
-                step *= min(1, 0.5 / max(np.abs(step).max(), 1e-12))
+                step *= min(1, SCREEN_FIT.longest_step / max(np.abs(step).max(), TINY))
                 tried = u + step
                 gained = cost - self.cost(tried)
                 if gained > 0:
@@ -352,23 +346,24 @@ class _Fit:
                 break
         return u
 
-    def suppose(self, u: Array) -> None:
+    def prepare(self, u: Array) -> None:
         """The room behind the screen, the pixels to compare and what to expect of their errors, for
         the screen at ``u``."""
         seen = self.look(u)[0]
         share = seen[..., 3]
         self.room, spread = self.background(self.image, share)
-        self.use = ndimage.distance_transform_edt(share < 0.003) <= EDGE
+        self.use = ndimage.distance_transform_edt(share < SCREEN_FIT.outside) <= SCREEN_FIT.edge
         self.deviation = 1.0
-        error = np.abs(self.errors(u, seen))
+        error = self.errors(u, seen)
         gain = np.exp(u[_GAIN])
         level = float(gain.mean())
         model = seen[..., :3] * gain + (1 - share)[..., None] * self.room
-        shot = np.sqrt(level * (model + 0.02 * level))
-        inside = (share > 0.98)[..., None] & ~self.clipped
+        shot = np.sqrt(level * (model + SCREEN_FIT.dark_noise * level))
+        inside = (share > SCREEN_FIT.inside)[..., None] & ~self.clipped
         relative = (error / shot)[inside]
-        a = 1.48 * float(np.median(relative)) if relative.size else 0.1
-        self.deviation = np.hypot(max(a, 0.003) * shot, (1 - share)[..., None] * spread)
+        noise = float(robust_spread(relative)) if relative.size else SCREEN_FIT.first_noise
+        noise = max(noise, SCREEN_FIT.least_noise)
+        self.deviation = np.hypot(noise * shot, (1 - share)[..., None] * spread)
 
     def errors(self, u: Array, seen: Array) -> Array:
         """Observed less expected (H, W, 3), in deviations, where the pixels have ``seen`` that.
@@ -393,24 +388,27 @@ class _Fit:
             return model if slopes is None else slopes
 
         def mix(image: Array) -> Array:
-            luma = (image @ LUMA)[..., None]
+            luma = (image @ np.array(JPEG_LUMA))[..., None]
             return np.asarray(luma + _blur(image - luma, math.exp(u[_COLOUR])))
 
-        model = np.maximum(model, 1e-6)
-        mixed = np.maximum(mix(model ** (1 / CURVE)), 1e-3)
+        linear, encoded = SCREEN_FIT.least_radiance
+        model = np.maximum(model, linear)
+        mixed = np.maximum(mix(model ** (1 / JPEG_GAMMA)), encoded)
         if slopes is None:
-            return np.asarray(mixed**CURVE)
-        return np.asarray(mix(slopes * model ** (1 / CURVE - 1)) * mixed ** (CURVE - 1))
+            return np.asarray(mixed**JPEG_GAMMA)
+        by_code = mix(slopes * model ** (1 / JPEG_GAMMA - 1))
+        return np.asarray(by_code * mixed ** (JPEG_GAMMA - 1))
 
     def cost(self, u: Array) -> float:
-        """Cauchy's loss of the errors and half the prior's square; no rig, no end of it."""
+        """Cauchy's loss of the errors and half the prior's square; infinite for no possible rig."""
         e_x, e_y, corner = self.screen(u)
         if not corner[2] + min(e_x[2], 0) + min(e_y[2], 0) > 0:  # it reaches below the table
             return math.inf
         seen = self.look(u)[0]
         r = self.errors(u, seen)[self.use]
-        off = u - self.usual
-        return float(ROBUST**2 / 2 * np.log1p((r / ROBUST) ** 2).sum() + off @ self.prior @ off / 2)
+        off, robust = u - self.prior_mean, SCREEN_FIT.robust
+        loss = robust**2 / 2 * np.log1p((r / robust) ** 2).sum()
+        return float(loss + off @ self.prior @ off / 2)
 
     def normal_equations(self, u: Array) -> tuple[Array, Array]:
         """Gauss–Newton's matrix and right side for the free unknowns, with Cauchy's weights."""
@@ -427,35 +425,36 @@ class _Fit:
             by[9 + c, ..., c] = seen[..., c] * gain[c]
         by = self.code(u, model, by)
         if self.coded:
-            more = u + _STEP * (np.arange(_COUNT) == _COLOUR)
-            by[_COLOUR] = (self.code(more, model) - self.code(u, model)) / _STEP
+            step = SCREEN_FIT.difference
+            more = u + step * (np.arange(_COUNT) == _COLOUR)
+            by[_COLOUR] = (self.code(more, model) - self.code(u, model)) / step
         jacobian = np.moveaxis(by[self.free] / self.deviation, 0, -1)[self.use]
         jacobian[self.clipped[self.use] & (r == 0)] = 0
         j = jacobian.reshape(r.size, -1)
-        weighted = j / (1 + (r.reshape(-1, 1) / ROBUST) ** 2)
+        weighted = j / (1 + (r.reshape(-1, 1) / SCREEN_FIT.robust) ** 2)
         prior = self.prior[self.free]
         matrix = j.T @ weighted + prior[:, self.free]
-        return matrix, weighted.T @ r.reshape(-1) - prior @ (u - self.usual)
+        return matrix, weighted.T @ r.reshape(-1) - prior @ (u - self.prior_mean)
 
-    def rest(self, error: Array) -> float:
-        """Root mean square of errors (n, 3), with Huber's weights."""
+    def residual(self, error: Array) -> float:
+        """Root mean square of absolute errors (n, 3), with Huber's weights."""
         if not error.size:
             return 0.0
-        weight = np.minimum(1, 2 * np.median(error, 0) / np.maximum(error, 1e-12))
+        weight = np.minimum(1, 2 * np.median(error, 0) / np.maximum(error, TINY))
         return float(np.sqrt(((weight * error**2).sum(0) / weight.sum(0)).mean()))
 
     def result(self, u: Array) -> Screen:
         """What the fit says, with the pattern through the display's curve."""
         gamma, gain = np.exp(u[_GAMMA]), np.exp(u[_GAIN])
         seen = self.look(u)[0]
-        inside = seen[..., 3] > 0.98
-        open_ = inside & ~self.clipped.any(-1)
+        inside = seen[..., 3] > SCREEN_FIT.inside
+        unclipped = inside & ~self.clipped.any(-1)
         error = np.abs(self.errors(u, seen) * self.deviation)
-        residual = self.rest(error[open_]) / float(gain.mean())
+        residual = self.residual(error[unclipped]) / float(gain.mean())
         spread = np.zeros(6)
         if self.free[0]:
             spread = np.sqrt(np.diag(np.linalg.inv(self.normal_equations(u)[0]))[:6])
-        units = SHIFT_PRIOR * self.rig.sample_size, TILT_PRIOR
+        shift = SCREEN_FIT.shift_deviation * self.rig.sample_size
         return Screen(
             rig=self.moved(u),
             shown=np.maximum(self.full, 0) ** gamma,
@@ -465,9 +464,9 @@ class _Fit:
             residual=residual,
             ideal_residual=residual,
             deviation=(
-                float(np.linalg.norm(spread[:3])) * units[0],
-                float(np.linalg.norm(spread[3:])) * units[1],
+                float(np.linalg.norm(spread[:3])) * shift,
+                float(np.linalg.norm(spread[3:])) * SCREEN_FIT.tilt_deviation,
             ),
-            pixels=int(open_.sum()) * self.step**2,
-            saturated=float(1 - open_.sum() / max(inside.sum(), 1)),
+            pixels=int(unclipped.sum()) * self.step**2,
+            saturated=float(1 - unclipped.sum() / max(inside.sum(), 1)),
         )

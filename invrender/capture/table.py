@@ -7,18 +7,12 @@ from typing import Any
 import numpy as np
 
 from invrender.capture.mirror import Ball
+from invrender.capture.settings import TABLE_METER
 from invrender.files.images import Photo
 from invrender.rig import Rig
 from invrender.sampling import resize_pattern
 from invrender.sphere import resample_environment, sky_flux
 from invrender.types import Array, Mask
-
-BLOCKS = 64  # across the photo; the table is compared as the means of these
-SIDE = 32  # pixels of a block that count, a side, at most about
-CELLS = 16  # of the screen, a side
-ROWS = 32  # of the environment that is not clipped
-MIN_PAIRS = 50
-LAGS = (8, 16, 32)  # blocks between those that are compared
 
 
 def lit_table(
@@ -28,9 +22,11 @@ def lit_table(
     and their irradiance (n, 3) from the screen and the filled environment."""
     seen, points, use = table_blocks(photo, rig, ball)
     at = points[use]
-    cells = resize_pattern(pattern, CELLS) * gain
-    screen = np.einsum("nij,ijc->nc", rig.screen_cosines(at, CELLS), cells)
-    room = room_irradiance(rig, at, resample_environment(environment, ROWS))
+    count = TABLE_METER.screen_cells
+    cells = resize_pattern(pattern, count) * gain
+    screen = np.einsum("nij,ijc->nc", rig.screen_cosines(at, count), cells)
+    rows = TABLE_METER.environment_rows
+    room = room_irradiance(rig, at, resample_environment(environment, rows))
     return np.log(seen[use]), at, use, screen + room
 
 
@@ -39,8 +35,9 @@ def table_blocks(photo: Photo, rig: Rig, ball: Ball) -> tuple[Array, Array, Mask
 
     Sample, ball, its contact shadow and saturated blocks do not count.
     """
-    step = max(1, photo.width // (BLOCKS * SIDE))
-    k = max(1, photo.width // (BLOCKS * step))
+    blocks = TABLE_METER.blocks
+    step = max(1, photo.width // (blocks * TABLE_METER.block_pixels))
+    k = max(1, photo.width // (blocks * step))
     h, w = photo.height // (k * step), photo.width // (k * step)
 
     def cut(a: Any) -> Any:
@@ -51,31 +48,29 @@ def table_blocks(photo: Photo, rig: Rig, ball: Ball) -> tuple[Array, Array, Mask
     block = k * step
     centre = np.stack(np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5), -1) * block
     ray = rig.rays(centre, photo.height, photo.width)
-    down = ray[..., 2] < -0.2
+    down = ray[..., 2] < -TABLE_METER.downward
     points = rig.camera - ray * (rig.camera[2] / np.where(down, ray[..., 2], -1))[..., None]
     block = block / rig.focal(photo.width) * rig.camera[2]
-    sample = (np.abs(points[..., :2]) < rig.sample_size / 2 + 1.5 * block).all(-1)
+    margin = TABLE_METER.sample_margin * block
+    sample = (np.abs(points[..., :2]) < rig.sample_size / 2 + margin).all(-1)
     distance = np.linalg.norm(points - np.asarray(ball.position), axis=-1)
-    use = down & ~sample & (distance > 3 * ball.radius_m + block)
+    use = down & ~sample & (distance > TABLE_METER.ball_margin * ball.radius_m + block)
     use &= ~cut(photo.clipped).any((1, 3)) & (mean.min(-1) > 0)
     return mean, points, use
 
 
 def distant_pairs(use: Mask) -> list[tuple[tuple[Any, Any], int]]:
-    """Pairs of used blocks, as indices among these, each of `LAGS` apart down and across: those of
-    one lag and way, and the lag. Too few pairs do not count."""
+    """Pairs of used blocks, as indices among these, each of `TABLE_METER.lags` apart down and
+    across: those of one lag and way, and the lag. Too few pairs do not count."""
     index = np.full(use.shape, -1)
     index[use] = np.arange(use.sum())
     pairs = []
-    for lag in LAGS:
+    for lag in TABLE_METER.lags:
         for first, second in ((index[lag:], index[:-lag]), (index[:, lag:], index[:, :-lag])):
             both = (first >= 0) & (second >= 0)
-            if both.sum() >= MIN_PAIRS:
+            if both.sum() >= TABLE_METER.least_pairs:
                 pairs.append(((first[both], second[both]), lag))
     return pairs
-
-
-AT_ONCE = 2_000_000  # pairs of a point and a direction
 
 
 def hidden_by_screen(rig: Rig, points: Array, direction: Array) -> Mask:
@@ -84,7 +79,7 @@ def hidden_by_screen(rig: Rig, points: Array, direction: Array) -> Mask:
     normal = np.cross(e_x, e_y)
     from_corner = np.asarray(points) - rig.screen_corner
     out = np.empty((len(from_corner), len(direction)), bool)
-    step = max(1, AT_ONCE // max(len(direction), 1))
+    step = max(1, TABLE_METER.at_once // max(len(direction), 1))
 
     def along(axis: Array, part: Array, t: Array) -> Array:
         return np.asarray((part @ axis)[:, None] + t * (direction @ axis)) / (axis @ axis)
@@ -104,7 +99,7 @@ def room_irradiance(rig: Rig, points: Array, environment: Array) -> Array:
     d, flux = sky_flux(environment)
     lit = np.flatnonzero(flux.any(-1))
     out = np.empty((len(points), 3))
-    step = max(1, AT_ONCE // max(len(lit), 1))
+    step = max(1, TABLE_METER.at_once // max(len(lit), 1))
     for i in range(0, len(points), step):
         out[i : i + step] = ~hidden_by_screen(rig, points[i : i + step], d[lit]) @ flux[lit]
     return out

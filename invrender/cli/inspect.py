@@ -13,9 +13,8 @@ from PIL import Image, ImageDraw
 from rich.console import Console
 
 from invrender.capture.crop import crop_mask, sample_corners
-from invrender.capture.lights import Lights, extract_lights, light_warnings
+from invrender.capture.lights import Lights, find_lights
 from invrender.capture.mirror import Ball, horizon_points, mirror_normals, outline_points
-from invrender.capture.orientation import find_upright_ball
 from invrender.cli import arguments
 from invrender.colour import linear_to_srgb
 from invrender.files.capture import Capture, check_photo, load_capture
@@ -63,11 +62,12 @@ def run(args: argparse.Namespace, console: Console) -> int:
         check_photo(photo, str(args.capture))
         rig = Rig() if photo.fov is None else Rig(fov=photo.fov)
         capture = Capture(photo, rig, default_pattern())
-    told = capture.rig
-    capture, ball, turned = find_upright_ball(capture, args.ball)
-    lights = extract_lights(capture, ball)
+    nominal = capture.rig
+    found = find_lights(capture, ball=args.ball)
+    capture, ball, lights = found.capture, found.ball, found.lights
+    assert ball is not None
     numbers = summary(capture, ball, lights)
-    numbers["warnings"] = [*turned, *numbers["warnings"]]
+    numbers["warnings"] = [*(notice.text for notice in found.notices), *numbers["warnings"]]
     if args.out is not None:
         args.out.mkdir(parents=True, exist_ok=True)
         with atomic_path(args.out / "inspect.png") as path:
@@ -84,7 +84,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     for line in (
         f"photo   {capture.photo.width} × {capture.photo.height} pixels, field of view "
         f"{capture.rig.fov:.1f}°",
-        f"camera  {_moved(told, capture.rig)}",
+        f"camera  {_moved(nominal, capture.rig)}",
         f"ball    at {x:.1f}, {y:.1f}, radius {ball.radius:.1f} pixels, "
         + ("given by hand" if args.ball else f"confidence {ball.confidence:.2f}"),
         f"screen  radiance of white {gain}; pattern fits to {fit['residual']:.1%}, display's gamma "
@@ -98,11 +98,11 @@ def run(args: argparse.Namespace, console: Console) -> int:
     return 0
 
 
-def _moved(told: Rig, found: Rig) -> str:
-    if found.camera_shift == told.camera_shift:
+def _moved(nominal: Rig, found: Rig) -> str:
+    if found.camera_shift == nominal.camera_shift:
         return "where the rig puts it"
-    shift = np.subtract(found.camera_shift, told.camera_shift)
-    tilt = np.subtract(found.camera_tilt, told.camera_tilt)
+    shift = np.subtract(found.camera_shift, nominal.camera_shift)
+    tilt = np.subtract(found.camera_tilt, nominal.camera_tilt)
     return (
         f"{1000 * np.linalg.norm(shift):.1f} mm and {np.linalg.norm(tilt):.1f}° from where the rig "
         "puts it, by the sample's square"
@@ -131,7 +131,7 @@ def summary(capture: Capture, ball: Ball, lights: Lights) -> dict[str, Any]:
         "room_saturated": lights.fit["room_saturated"],
         "pattern_share": share,
         "exposure": capture.photo.exposure,
-        "warnings": [*light_warnings(lights), *_photo_warnings(capture, ball, lights, share)],
+        "warnings": _photo_warnings(capture, ball, lights, share),
     }
 
 

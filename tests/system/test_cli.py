@@ -54,7 +54,7 @@ def test_report_tells_what_was_gained(result):
     assert report["photo_error"]["refined"] < 0.5 * report["photo_error"]["initial"]
     errors = report["map_error"]
     assert errors["refined"]["average"] < 0.8 * errors["initial"]["average"]
-    assert {"ball", "lights", "refine", "render"} <= report["seconds"].keys()
+    assert {"lights", "refine", "render"} <= report["seconds"].keys()
 
 
 def test_module_is_a_command(tmp_path):

@@ -11,7 +11,7 @@ from synthetic_photo import blocks, photograph
 
 from invrender.capture.lights import Lights, light_warnings
 from invrender.capture.orientation import oriented
-from invrender.capture.screen import SATURATED
+from invrender.capture.settings import SCREEN_FIT
 from invrender.cli.main import main
 from invrender.colour import linear_to_srgb
 from invrender.files.rig_toml import write_rig
@@ -75,9 +75,11 @@ def test_a_ball_without_the_pattern_is_refused(folder, tmp_path, capsys):
 def test_saturated_lights_are_told():
     lights = Lights(
         *(np.zeros((1, 1)),) * 3, np.ones(3), np.zeros((1, 1)), RIG,
-        {"saturated": 2 * SATURATED, "room_saturated": 0.02, "pattern_residual": 0.5},
+        {"saturated": 2 * SCREEN_FIT.saturated, "room_saturated": 0.02, "pattern_residual": 0.5},
     )  # fmt: skip
-    text = " ".join(light_warnings(lights))
+    notices = light_warnings(lights)
+    assert [n.code for n in notices] == ["screen-saturated", "room-saturated", "pattern-fits-badly"]
+    text = " ".join(n.text for n in notices)
     assert "2% of the screen" in text and "2.0% of the room" in text and "this pattern" in text
     assert not light_warnings(Lights(*(np.zeros((1, 1)),) * 3, np.ones(3), np.zeros(1), RIG))
 

@@ -68,7 +68,7 @@ def test_dark_room_without_ball(tmp_path, truth):
     stage = Stages()
     seen = see(folder, SIZE, stage, environment=np.zeros((8, 16, 3), np.float32), gain=GAIN)
     _, result, _ = recover([seen], stage, init="flat")
-    assert "ball" not in stage.seconds
+    assert seen.ball is None
     assert np.abs(result.maps.diffuse - truth.diffuse).mean() < 0.03
 
 

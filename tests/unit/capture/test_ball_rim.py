@@ -11,6 +11,7 @@ from invrender.capture import ball_rim as rim
 from invrender.capture.ball_image import trace_ball
 from invrender.capture.ball_view import View, view_around
 from invrender.capture.mirror import make_ball, on_table
+from invrender.capture.settings import RIM_FIT
 from invrender.files.images import Photo
 from invrender.rig import Rig
 
@@ -31,7 +32,7 @@ def unknowns(rig, shift=(0.0, 0.0)):
 
 def off(found: rim.Rim, rig, shift=(0.0, 0.0)) -> float:
     """The greatest error of the outline's centre and radius in the photo, in radii."""
-    seen = make_ball(found.rig, np.array([*found.theta[:2], 0]), found.theta[2], SIZE)
+    seen = make_ball(found.rig, np.array([*found.circle[:2], 0]), found.circle[2], SIZE)
     true = make_ball(rig, rig.ball_centre + np.array([*shift, 0]), rig.ball_radius, SIZE)
     distance = np.hypot(*np.subtract(seen.centre, true.centre))
     return float(max(distance, abs(seen.radius - true.radius)) / true.radius)
@@ -45,7 +46,7 @@ def test_rays_in_the_planes_are_those_in_space(shift, double, monkeypatch):
         monkeypatch.setattr(rim, "_single", np.asarray)
     p = unknowns(TILTED, shift)
     view = view_of(np.ones((*SIZE, 3), np.float32), TILTED, shift)
-    lines = rim._Lines(view, view.image[..., 0], TILTED, p, 16, 0.0, 1.25, rim.TILT_PRIOR)
+    lines = rim._Lines(view, view.image[..., 0], TILTED, p, 16, 0.0, 1.25, RIM_FIT.tilt_deviation)
     got = lines.trace(p)
     centre = np.array([p[0], p[1], 0])
     middle = view.at(centre, TILTED)
@@ -120,5 +121,5 @@ def test_a_blurred_photo_is_no_smaller_ball():
 def test_an_empty_photo_gives_finite_numbers(level):
     image = np.full((*SIZE, 3), level, np.float32)
     found = rim.fit_rim(view_of(image), RIG, unknowns(RIG)[:3])
-    assert np.isfinite(found.theta).all()
+    assert np.isfinite(found.circle).all()
     assert np.isfinite(found.deviation)

@@ -7,7 +7,7 @@ import pytest
 from scipy import ndimage
 from synthetic_photo import blocks, grey_table, light_from, photograph, sky, textured_table
 
-from invrender.capture.ball_image import screen_coordinates
+from invrender.capture.ball_image import screen_coordinates, trace_image
 from invrender.capture.clipped_lamps import raise_clipped
 from invrender.capture.environment import fill_environment, unfold_environment
 from invrender.capture.hidden_lamp import add_hidden_lamp
@@ -19,6 +19,7 @@ from invrender.sphere import directions, irradiance, solid_angles
 
 RIG, SIZE = Rig(), (480, 640)
 BALL = make_ball(RIG, RIG.ball_centre, RIG.ball_radius, SIZE)
+IMAGE = trace_image(RIG, BALL)
 PATTERN, GAIN = blocks(), np.array([0.8, 0.85, 0.75])
 TILTED = [(0.6, 0, 0.8), (-0.6, 0, 0.8), (0, 0.6, 0.8), (0, -0.6, 0.8)]
 LEVEL = 0.95
@@ -69,14 +70,14 @@ def picture(light, albedo, room=room):
 
     image = photograph(RIG, *SIZE, room, table, PATTERN, GAIN)
     photo = Photo(np.minimum(image, 1).astype(np.float32), LEVEL)
-    return photo, *unfold_environment(photo, RIG, BALL, 64)
+    return photo, *unfold_environment(photo, RIG, IMAGE, 64)
 
 
 @pytest.mark.parametrize("albedo", [plain_table, textured_table])
 def test_the_table_tells_how_bright_clipped_lamps_are(light, albedo):
     photo, environment, coverage = picture(light, albedo)
     truth = room(directions(256, 512).astype(float))
-    raised, factor = raise_clipped(photo, RIG, BALL, PATTERN, GAIN, environment, coverage)
+    raised, factor = raise_clipped(photo, RIG, IMAGE, PATTERN, GAIN, environment, coverage)
 
     def error(seen):
         seen = fill_environment(seen, coverage)
@@ -93,7 +94,7 @@ def test_the_table_tells_how_bright_clipped_lamps_are(light, albedo):
 def test_nothing_clipped_nothing_raised(light):
     photo, environment, coverage = picture(light, grey_table)
     for whole in (replace(photo, clip_level=None), replace(photo, clip_level=2.0)):
-        found = raise_clipped(whole, RIG, BALL, PATTERN, GAIN, environment, coverage)
+        found = raise_clipped(whole, RIG, IMAGE, PATTERN, GAIN, environment, coverage)
         assert found[0] is environment and found[1] == 1
 
 
@@ -131,7 +132,7 @@ def test_a_table_that_says_nothing_leaves_the_prior(table, light):
     image[:, :250] = image[:, 390:] = table
     image[:180] = image[300:] = table
     bad = replace(photo, image=image)
-    raised, factor = raise_clipped(bad, RIG, BALL, PATTERN, GAIN, environment, coverage)
+    raised, factor = raise_clipped(bad, RIG, IMAGE, PATTERN, GAIN, environment, coverage)
     assert np.isfinite(raised).all() and 1 <= factor < 500
 
 

@@ -5,8 +5,9 @@ import pytest
 from scipy import ndimage
 from synthetic_photo import blocks, grey_table, photograph, sky, textured_table
 
+from invrender.capture.ball_image import trace_image
 from invrender.capture.environment import fill_environment, unfold_environment
-from invrender.capture.glare import lift_veil
+from invrender.capture.glare import remove_glare
 from invrender.capture.mirror import make_ball
 from invrender.capture.table import room_irradiance
 from invrender.files.images import Photo
@@ -14,6 +15,7 @@ from invrender.rig import Rig
 
 RIG, SIZE = Rig(), (720, 960)
 BALL = make_ball(RIG, RIG.ball_centre, RIG.ball_radius, SIZE)
+IMAGE = trace_image(RIG, BALL)
 
 
 @pytest.fixture(scope="module", params=[grey_table, textured_table])
@@ -31,7 +33,7 @@ def veil(angle, width, colour):
 @pytest.mark.parametrize("angle", [0.5, 4.0])
 def test_a_veil_is_lifted(image, angle):
     light = veil(angle, 0.5, (0.3, 0.4, 0.35))
-    found = lift_veil(Photo((image + light).astype(np.float32)), RIG, BALL).image
+    found = remove_glare(Photo((image + light).astype(np.float32)), RIG, IMAGE).image
     y, x = np.mgrid[: SIZE[0], : SIZE[1]] + 0.5
     above = np.hypot(x - BALL.centre[0], y - BALL.centre[1]) < 0.7 * BALL.radius
     assert np.abs(found - image)[above].mean() < 0.3 * light[above].mean()
@@ -41,15 +43,15 @@ def test_without_a_veil_nothing_changes(image):
     rng = np.random.default_rng(3)
     noisy = image + 0.02 * rng.standard_normal(image.shape)
     for photo in (Photo(image), Photo(np.maximum(noisy, 0).astype(np.float32))):
-        assert lift_veil(photo, RIG, BALL) is photo
+        assert remove_glare(photo, RIG, IMAGE) is photo
     black = Photo(np.zeros_like(image))
-    assert lift_veil(black, RIG, BALL) is black
+    assert remove_glare(black, RIG, IMAGE) is black
 
 
 def test_saturated_pixels_stay_saturated(image):
     light = image + veil(2.0, 0.5, (2.0, 2.0, 2.0))
     photo = Photo(np.minimum(light, 1).astype(np.float32), 0.99)
-    found = lift_veil(photo, RIG, BALL)
+    found = remove_glare(photo, RIG, IMAGE)
     assert photo.clipped.any() and (found.clipped == photo.clipped).all()
 
 
@@ -61,7 +63,7 @@ def test_the_screen_does_not_light_the_room_beside_it():
     even = np.where(np.arange(64)[:, None, None] < 32, level, 0) * np.ones((64, 128, 3))
 
     def error(blur):
-        room, coverage = unfold_environment(photo, RIG, BALL, 64, blur=blur)
+        room, coverage = unfold_environment(photo, RIG, IMAGE, 64, blur=blur)
         assert coverage[:32].mean() > 0.6
         found, true = (
             room_irradiance(RIG, np.zeros((1, 3)), e)

@@ -6,11 +6,11 @@ from PIL import Image
 from scipy import ndimage
 from synthetic_photo import blocks, grey_table, light_from, photograph, sky, textured_table
 
-from invrender.capture.ball import MIN_CONFIDENCE, find_ball
+from invrender.capture.ball import find_ball
 from invrender.capture.ball_image import trace_ball
 from invrender.capture.crop import crop_sample
 from invrender.capture.environment import fill_environment
-from invrender.capture.lights import extract_lights, level
+from invrender.capture.lights import level_table, measure_lights
 from invrender.capture.mirror import (
     horizon_points,
     make_ball,
@@ -18,7 +18,8 @@ from invrender.capture.mirror import (
     outline_points,
     place_ball,
 )
-from invrender.capture.orientation import find_upright_ball
+from invrender.capture.orientation import find_ball_and_orientation
+from invrender.capture.settings import BALL_SEARCH
 from invrender.capture.table import room_irradiance
 from invrender.colour import linear_to_srgb
 from invrender.files.capture import Capture, load_capture
@@ -53,7 +54,7 @@ def clean():
 @pytest.fixture(scope="module")
 def lights(clean):
     capture = Capture(Photo(clean), RIG, PATTERN)
-    return extract_lights(capture, find_ball(capture.photo, RIG))
+    return measure_lights(capture, find_ball(capture.photo, RIG))
 
 
 # --- geometry of the mirror ---------------------------------------------------------------------
@@ -141,7 +142,7 @@ def test_ball_is_found_in_damaged_photos(clean, tmp_path, damage):
         photo = Photo(image)
     ball = find_ball(photo, RIG)
     assert max(off(ball, true_ball())) < 0.02
-    assert ball.confidence > MIN_CONFIDENCE
+    assert ball.confidence > BALL_SEARCH.least_confidence
 
 
 @pytest.mark.parametrize("table", [grey_table, textured_table])
@@ -208,7 +209,7 @@ def test_small_lamp_keeps_its_energy():
         return np.where(on[..., None], 800.0, 0.1) * np.ones(3)
 
     image = photograph(RIG, *SIZE, environment=lamp, samples=5)
-    got = extract_lights(Capture(Photo(image), RIG, PATTERN), true_ball())
+    got = measure_lights(Capture(Photo(image), RIG, PATTERN), true_ball())
     height = got.environment.shape[0]
     fine = lamp(directions(1024, 2048)).reshape(
         height, 1024 // height, 2 * height, 1024 // height, 3
@@ -228,10 +229,10 @@ def test_pattern_and_gain(lights):
 def test_gain_under_blur_and_display_gamma():
     image = photograph(RIG, *SIZE, pattern=PATTERN**1.3)
     photo = Photo(ndimage.gaussian_filter(image, (0.8, 0.8, 0)))
-    fit = extract_lights(Capture(photo, RIG, PATTERN), true_ball()).fit
+    fit = measure_lights(Capture(photo, RIG, PATTERN), true_ball()).fit
     assert fit["gamma"] == pytest.approx(1.3, abs=0.1)
     photo = Photo(ndimage.gaussian_filter(photograph(RIG, *SIZE), (0.8, 0.8, 0)))
-    got = extract_lights(Capture(photo, RIG, PATTERN), true_ball())
+    got = measure_lights(Capture(photo, RIG, PATTERN), true_ball())
     np.testing.assert_allclose(got.gain, GAIN, rtol=0.03)
     assert got.fit["blur"] == pytest.approx(0.8, abs=0.3)
 
@@ -272,7 +273,7 @@ def tilted():
 def test_the_table_is_levelled_about_the_ball(tilted):
     rig, photo = tilted
     ball = find_ball(photo, RIG)
-    found = level(photo, RIG, ball)
+    found = level_table(photo, RIG, ball)
     np.testing.assert_allclose(found.camera_tilt, rig.camera_tilt, atol=0.5)
     # The camera sees the ball and the screen where it saw them; only the table is another.
     centre = np.asarray(ball.position)
@@ -298,10 +299,10 @@ def test_a_tilted_camera_leaves_the_light_on_the_table(tilted):
         return np.abs(room_irradiance(lights.rig, points, lights.environment) / true - 1).mean()
 
     ball = find_ball(photo, RIG)
-    told = extract_lights(Capture(photo, RIG, PATTERN), ball, height)
+    told = measure_lights(Capture(photo, RIG, PATTERN), ball, height)
     assert told.fit["camera_tilt"] == pytest.approx(2.3, abs=0.6)
     # A JPEG's photo has a clipping level, and is taken as straight.
-    straight = extract_lights(Capture(replace(photo, clip_level=1e3), RIG, PATTERN), ball, height)
+    straight = measure_lights(Capture(replace(photo, clip_level=1e3), RIG, PATTERN), ball, height)
     assert straight.fit["camera_tilt"] == 0
     assert error(told) < 0.5 * error(straight)
 
@@ -310,15 +311,15 @@ def test_the_tilt_turns_with_the_photo(tilted):
     """A photo of which it is not known which side is up is levelled as well."""
     rig, photo = tilted
     turned = Capture(Photo(np.rot90(photo.image, -1)), RIG, PATTERN)
-    _, ball, told = find_upright_ball(turned)
-    assert told and ball.size == SIZE
+    _, ball, notices = find_ball_and_orientation(turned)
+    assert [n.code for n in notices] == ["photo-turned"] and ball.size == SIZE
     np.testing.assert_allclose(ball.camera_tilt, rig.camera_tilt, atol=0.5)
 
 
 def test_a_tilt_that_the_rig_tells_is_kept(tilted):
     rig, photo = tilted
     ball = make_ball(rig, rig.ball_centre, rig.ball_radius, SIZE)
-    assert level(photo, rig, ball) is rig
+    assert level_table(photo, rig, ball) is rig
 
 
 @pytest.mark.parametrize("tilt", [37.0, 66.0, 120.0])
@@ -332,7 +333,7 @@ def test_a_ball_outside_the_photo_is_refused(clean, tilt):
 def test_photo_without_a_screen_is_refused(clean):
     dark = photograph(RIG, *SIZE, gain=(0.0, 0.0, 0.0))
     with pytest.raises(InputError, match="screen is dark"):
-        extract_lights(Capture(Photo(dark), RIG, PATTERN), true_ball())
+        measure_lights(Capture(Photo(dark), RIG, PATTERN), true_ball())
 
 
 # --- the sample ---------------------------------------------------------------------------------

@@ -8,7 +8,9 @@ from scipy import ndimage
 from synthetic_photo import blocks, photograph
 
 from invrender.capture import screen
+from invrender.capture.ball_image import trace_image
 from invrender.capture.mirror import make_ball
+from invrender.capture.settings import SCREEN_FIT
 from invrender.files.images import Photo
 from invrender.rig import Rig
 
@@ -17,6 +19,7 @@ RIG = Rig()
 MOVED = replace(RIG, screen_shift=(0.003, -0.002, 0.002), screen_tilt=(2.0, -1.5, 1.0))
 GAIN = (2.0, 2.1, 1.9)
 BALL = make_ball(RIG, RIG.ball_centre, RIG.ball_radius, SIZE)
+IMAGE = trace_image(RIG, BALL)
 
 
 @pytest.fixture(scope="module")
@@ -42,10 +45,10 @@ def unknowns(fit, seed=0):
 
 
 def test_the_slopes_are_those_of_the_cost(hard):
-    fit = screen._Fit(Photo(hard), RIG, BALL, blocks())
+    fit = screen._Fit(Photo(hard), RIG, IMAGE, blocks())
     fit.free[:] = True
     u = unknowns(fit)
-    fit.suppose(u)
+    fit.prepare(u)
     _, downhill = fit.normal_equations(u)
     step = 1e-3 * np.eye(14)
     slope = np.array([fit.cost(u - d) - fit.cost(u + d) for d in step]) / 2e-3
@@ -53,19 +56,19 @@ def test_the_slopes_are_those_of_the_cost(hard):
 
 
 def test_the_fits_screen_is_the_rigs(hard):
-    fit = screen._Fit(Photo(hard), RIG, BALL, blocks())
+    fit = screen._Fit(Photo(hard), RIG, IMAGE, blocks())
     several = np.stack([unknowns(fit, k) for k in range(3)])
     for u, *found in zip(several, *fit.screen(several), strict=True):
         rig = fit.moved(u)
         for got, wanted in zip(found, (*rig.screen_edges, rig.screen_corner), strict=True):
             np.testing.assert_allclose(got, wanted, rtol=1e-12, atol=1e-15)
     below = unknowns(fit, 0)
-    below[2] = -RIG.screen_height / (screen.SHIFT_PRIOR * RIG.sample_size)
+    below[2] = -RIG.screen_height / (SCREEN_FIT.shift_deviation * RIG.sample_size)
     assert fit.cost(below) == np.inf
 
 
 def test_lines_meet_the_screen_where_rays_do():
-    fit = screen._Fit(Photo(np.ones((*SIZE, 3), np.float32)), RIG, BALL, blocks())
+    fit = screen._Fit(Photo(np.ones((*SIZE, 3), np.float32)), RIG, IMAGE, blocks())
     u = np.zeros(13)
     u[:6] = [0.3, -0.2, 0.4, 0.3, -0.5, 0.2]
     a, b, c = np.moveaxis(fit.lines @ fit.forms(u), -1, 0)
@@ -77,7 +80,7 @@ def test_lines_meet_the_screen_where_rays_do():
 
 
 def test_a_moved_screen_is_found(clean):
-    found = screen.fit_screen(Photo(clean), RIG, BALL, blocks())
+    found = screen.fit_screen(Photo(clean), RIG, IMAGE, blocks())
     shift = np.subtract(found.rig.screen_shift, MOVED.screen_shift)
     tilt = np.subtract(found.rig.screen_tilt, MOVED.screen_tilt)
     assert np.linalg.norm(shift) < 6e-4
@@ -90,7 +93,10 @@ def test_a_ball_moved_by_nothing_changes_nothing(hard):
     x, y, z = BALL.position
     gain, moved = (
         screen.fit_screen(
-            Photo(hard), RIG, replace(BALL, position=(x + d, y - d, z)), blocks()
+            Photo(hard),
+            RIG,
+            trace_image(RIG, replace(BALL, position=(x + d, y - d, z))),
+            blocks(),
         ).gain
         for d in (0, 1e-10 * RIG.ball_radius)
     )
