@@ -34,7 +34,7 @@ def block_pattern(size: int = 256, blocks: int = 8, seed: int = 5) -> NDArray[np
 
 
 def default_pattern(size: int = 256) -> NDArray[np.float32]:
-    """The pattern that invrender shows unless told otherwise, (size, size, 3) in [0, 1]."""
+    """The default pattern, (size, size, 3) relative radiance in [0, 1], row 0 at +y."""
     return resize_pattern(_shipped(), size)
 
 

@@ -12,6 +12,7 @@ import runpy
 import shlex
 import sys
 import tomllib
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from unittest import mock
@@ -112,6 +113,7 @@ def parse(command: str) -> None:
         raise Parsed
 
     with (
+        warnings.catch_warnings(action="ignore"),  # runpy's, of modules that are loaded already
         mock.patch.object(argparse.ArgumentParser, "parse_args", only_parse),
         mock.patch.object(sys, "argv", [module, *arguments]),
         pytest.raises(Parsed),
@@ -121,15 +123,15 @@ def parse(command: str) -> None:
 
 def test_commands_exist():
     wrong = []
-    for page, command in sorted(set(commands())):
-        told = io.StringIO()
+    for command, page in sorted({command: page for page, command in commands()}.items()):
+        message = io.StringIO()
         try:
-            with contextlib.redirect_stderr(told):
+            with contextlib.redirect_stderr(message):
                 parse(command)
         except SystemExit:
             # An inline mention may leave out what is required, but nothing may be wrong.
-            if "arguments are required" not in told.getvalue():
-                wrong.append(f"{page}: {command}: {told.getvalue().splitlines()[-1]}")
+            if "arguments are required" not in message.getvalue():
+                wrong.append(f"{page}: {command}: {message.getvalue().splitlines()[-1]}")
     assert not wrong, "\n".join(wrong)
 
 

@@ -1,5 +1,4 @@
-"""Environment light: files, integrals over the sphere, and made-up rooms.
-
+"""Environment light: from files, and procedural rooms, skies, studios and nights.
 
 An environment is an equirectangular image (H, W, 3) of linear radiance, usually W = 2H: row 0 at
 the zenith (+z), column u at φ = 2π·u/W, φ = atan2(y, x). Its unit is arbitrary until

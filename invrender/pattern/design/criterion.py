@@ -5,7 +5,8 @@ photo is y = I(θ) + noise of variance N. With the Jacobian J at the truth,
 
     C = (P⁻¹ + Jᵀ N⁻¹ J)⁻¹,   criterion = Σ_m w_m · rms(posterior sd of map m) / rms(prior sd of m),
 
-over the groups of a population: 1 for a photo that tells nothing, 0 for one that tells all.
+over the groups of a population: 1 for a photo that says nothing of the maps, 0 for one that
+leaves no error.
 [Van Trees 1968, "Detection, Estimation, and Modulation Theory I", 2.4.3]
 """
 

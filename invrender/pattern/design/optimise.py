@@ -75,7 +75,8 @@ def _roughness(pattern: Array) -> tuple[float, Array]:
 def wheel(cells: int = CELLS, angle: float = 0.0, flip: bool = False) -> Array:
     """Hue by direction from the screen's centre, (cells, cells, 3): where searches start.
 
-    No two directions of a normal look alike, which a bound that is local does not ask for.
+    No two directions of a normal look alike in it. The criterion, a local bound, does not ask for
+    that.
     """
     u = (np.arange(cells) + 0.5) / cells - 0.5
     direction = np.arctan2(-u[:, None], u[None, :]) * (-1 if flip else 1) + angle
