@@ -127,7 +127,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(args: argparse.Namespace) -> None:
-    count = 9 if args.quick else args.count
+    count = 6 if args.quick else args.count
     rows: list[dict[str, Any]] = []
     wrong: list[dict[str, Any]] = []
     for i in range(count + -(-count // 4)):

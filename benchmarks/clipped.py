@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from benchmarks.common.captures import HOLDOUT
 from benchmarks.common.photos import Shot, arguments, make_shot
 from benchmarks.common.results import table, write_results
 from invrender.capture.ball_image import trace_image
@@ -26,6 +25,7 @@ from invrender.capture.environment import fill_environment, unfold_environment
 from invrender.capture.mirror import make_ball
 from invrender.data.environments import find_environments, procedural_environment, read_environment
 from invrender.sphere import irradiance, resample_environment
+from nets.training.draw import belongs
 
 Array = NDArray[np.floating[Any]]
 SEED = 3000  # photos from here on
@@ -45,8 +45,7 @@ def excess(rooms: Path | None, count: int = 60) -> tuple[float, float, int]:
     White is 12 to 100 times the mean radiance, as in photos exposed for the screen; rooms are
     blurred to the ball's resolution. Held-out rooms are left aside.
     """
-    held = HOLDOUT.read_text().split()
-    files = [p for p in find_environments(rooms) if p.stem not in held] if rooms else []
+    files = [p for p in find_environments(rooms) if belongs(p.stem, "train")] if rooms else []
     found = []
     for k in range(len(files) or count):
         room = read_environment(files[k], 256) if files else procedural_environment(k, 256)

@@ -24,7 +24,7 @@ import numpy as np
 import torch
 from scipy.optimize import minimize
 
-from benchmarks.common.captures import arguments, make_captures
+from benchmarks.common.captures import PHOTOGRAPHS, arguments, make_captures
 from benchmarks.common.gradients import sample_sensor
 from benchmarks.common.plot import plot_error_over_time
 from benchmarks.common.results import Table, bar, table, write_results
@@ -347,8 +347,8 @@ def main(args: argparse.Namespace) -> None:
         args.count, args.size, args.steps, args.seconds = 1, 16, 4, 1.0
     torch.set_num_threads(1)
     width, spp = (720, 24) if args.quick else (960, 32)
-    made = args.captures or args.out / "captures"
-    folders = make_captures(made, args.count, 256, width, spp, args.materials, args.envs)
+    made, real = args.captures or args.out / "captures", (args.materials, args.envs)
+    folders = make_captures(made, PHOTOGRAPHS, args.count, 256, width, spp, *real)
     results: dict[str, dict[str, Curve]] = {}
     for folder in folders:
         curves = results[folder.name] = measure(folder, args.size, args.seconds, args.steps)

@@ -16,13 +16,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.common.captures import arguments, make_captures
+from benchmarks.common.captures import CaptureSet, arguments, make_captures
 from benchmarks.common.results import table, write_results
 from invrender.maps import NAMES, resize_maps
 from invrender.pipeline import Stages, recover, see
 from invrender.report.results import deviations
 
-FIRST_SEEDS = {"real": 97_000, "made": 98_000}
+REAL = CaptureSet("train", 97_000, every=4)  # a few show all families
+MADE = CaptureSet("train", 98_000)
 SURE = 0.6827  # of a Gaussian within one sigma
 STEP = 4  # every how many pixels count: errors are shared by neighbours
 
@@ -48,15 +49,11 @@ def parser() -> argparse.ArgumentParser:
 
 def main(args: argparse.Namespace) -> None:
     count, size, width, spp = (2, 96, 480, 8) if args.quick else (args.count, 256, 960, 32)
+    sizes = (size, width, spp)
     kinds = {
-        "real": make_captures(
-            args.out / "real", count, size, width, spp, args.materials, args.envs,
-            FIRST_SEEDS["real"], trained=True,
-        ),
-        "made": make_captures(
-            args.out / "made", count // 2, size, width, spp, first=FIRST_SEEDS["made"]
-        ),
-    }  # fmt: skip
+        "real": make_captures(args.out / "real", REAL, count, *sizes, args.materials, args.envs),
+        "made": make_captures(args.out / "made", MADE, count // 2, *sizes),
+    }
     factors, covered = {}, {}
     for kind, folders in kinds.items():
         rows = []

@@ -16,14 +16,14 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.common.captures import arguments, make_capture, sample_and_room
+from benchmarks.common.captures import CaptureSet, arguments, make_capture, sample_and_room
 from benchmarks.common.results import bar, table, write_results
 from benchmarks.refine import measure, pooled
 from invrender.maps import NAMES
 from invrender.pattern.default import default_pattern
 from invrender.rig import Rig
 
-FIRST_SEED = 95_000
+DRAWN = CaptureSet("holdout", 95_000)
 GAIN, GAMMA = 1.25, 2.2  # at most, or one over it
 SHIFT, TILT = 0.1, 10.0  # at most, of the sample's size and degrees
 HELD = 2e-3, 1.2  # standard deviations, metres and degrees; at most two and a half of them
@@ -34,7 +34,7 @@ def make_captures(
     out: Path, k: int, size: int, width: int, spp: int, materials: Path | None, envs: Path | None
 ) -> dict[str, Path]:
     """The k-th sample under each condition; simulates what is not there yet."""
-    maps, room, rng = sample_and_room(k, size, materials, envs, FIRST_SEED)
+    maps, room, rng = sample_and_room(k, DRAWN, size, materials, envs)
     pattern = default_pattern()
     gain = np.exp(rng.uniform(-1, 1, 3) * np.log(GAIN)).astype(np.float32)
     shown = gain * pattern ** np.float32(np.exp(rng.uniform(-1, 1) * np.log(GAMMA)))

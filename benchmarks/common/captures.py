@@ -10,7 +10,7 @@ import argparse
 import io
 import os
 import tempfile
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,52 +32,66 @@ from invrender.maps import Maps, crop_maps, resize_maps, turn_maps
 from invrender.pattern.default import default_pattern
 from invrender.rig import Rig
 from invrender.sphere import rotate_environment, scale_environment
+from nets.training.draw import belongs
 
 Array = NDArray[np.floating[Any]]
-HOLDOUT = Path(__file__).parents[2] / "nets" / "training" / "holdout.txt"
-FIRST_SEED = 90_000  # of procedural materials and rooms that nothing else uses
 GAIN = 2.0  # radiance of the screen's white
 SHIFT, TILT = 3e-3, 3.0  # standard deviations, metres and degrees, of the screen's pose
 
 
-def choose(
-    materials: Path | None, rooms: Path | None, trained: bool = False
-) -> tuple[list[Path], list[Path]]:
-    """Folders of materials and files of rooms that the networks never trained on.
+@dataclass(frozen=True)
+class CaptureSet:
+    """What captures are drawn from.
 
-    trained: every fourth of those that they did train on, so that a few show all families.
+    split: of `nets.training.draw`, whose real materials and rooms are used, every ``every``-th
+    material. first_seed: of all that is drawn, capture k's is k higher; no two benchmarks share
+    one. noise: of the sensor, relative, logarithmically uniform between the two.
     """
-    names = {line.strip() for line in HOLDOUT.read_text().splitlines() if line[:1] != "#"}
-    samples = find_materials(materials) if materials else []
-    lights = find_environments(rooms) if rooms else []
-    if trained:
-        return [p for p in samples if p.name not in names][::4], [
-            p for p in lights if p.stem not in names
-        ]
-    return [p for p in samples if p.name in names], [p for p in lights if p.stem in names]
+
+    split: str
+    first_seed: int
+    noise: tuple[float, float] = (0.005, 0.005)
+    every: int = 1
+
+    def noise_of(self, k: int) -> float:
+        """The k-th capture's noise, of a pixel at the photo's 99th percentile."""
+        low, high = self.noise
+        share = np.random.default_rng((self.first_seed, k)).uniform()
+        return float(low * (high / low) ** share)
+
+    def choose(self, materials: Path | None, rooms: Path | None) -> tuple[list[Path], list[Path]]:
+        """Folders of materials and files of rooms that belong to the split."""
+        samples = find_materials(materials) if materials else []
+        lights = find_environments(rooms) if rooms else []
+        samples = [p for p in samples if belongs(p.name, self.split)][:: self.every]
+        return samples, [p for p in lights if belongs(p.stem, self.split)]
+
+
+PHOTOGRAPHS = CaptureSet("holdout", 90_000)
+OTHERS = CaptureSet("families", 190_000, noise=(0.002, 0.02))
 
 
 def make_captures(
-    out: Path, count: int, size: int, width: int, spp: int,
+    out: Path, drawn: CaptureSet, count: int, size: int, width: int, spp: int,
     materials: Path | None = None, rooms: Path | None = None,
-    first: int = FIRST_SEED, trained: bool = False,
 ) -> list[Path]:  # fmt: skip
     """Capture folders ``out``/000 and so on; simulates those that are not there yet.
 
     size: pixels a side of the maps; width: of the photos; spp: path tracer's samples. Without
-    folders, materials and rooms are procedural. Capture k depends on k and these alone; others have
-    another ``first`` seed, ``trained`` ones materials and rooms that the networks have seen.
+    folders, materials and rooms are procedural. Capture k depends on k and these alone.
     """
     folders = [out / f"{k:03d}" for k in range(count)]
     for k, folder in enumerate(folders):
         if folder.exists():
             continue
-        maps, room, rng = sample_and_room(k, size, materials, rooms, first, trained)
+        maps, room, rng = sample_and_room(k, drawn, size, materials, rooms)
         shift = np.clip(rng.normal(0, SHIFT, 3), -2 * SHIFT, 2 * SHIFT)
         tilt = np.clip(rng.normal(0, TILT, 3), -2 * TILT, 2 * TILT)
         rig = Rig(screen_shift=tuple(shift.tolist()), screen_tilt=tuple(tilt.tolist()))
         quality = int(rng.integers(85, 97)) if k % 2 else None
-        make_capture(folder, maps, room, rig, default_pattern(), width, spp, k, quality)
+        make_capture(
+            folder, maps, room, rig, default_pattern(), width, spp, k, quality, drawn.noise_of(k)
+        )
     return folders
 
 
@@ -91,25 +105,25 @@ def arguments(doc: str | None, quick: str, count: int) -> argparse.ArgumentParse
 
 
 def sample_and_room(
-    k: int, size: int, materials: Path | None, rooms: Path | None,
-    first: int = FIRST_SEED, trained: bool = False,
-) -> tuple[Maps, Array, np.random.Generator]:  # fmt: skip
+    k: int, drawn: CaptureSet, size: int, materials: Path | None, rooms: Path | None
+) -> tuple[Maps, Array, np.random.Generator]:
     """The k-th material and room, and the random numbers of what else is drawn for them."""
-    found, found_rooms = choose(materials, rooms, trained)
-    rng = np.random.default_rng(first + k)
-    maps = _material(found, k, size) if found else procedural_material(first + k, size, size)
+    found, found_rooms = drawn.choose(materials, rooms)
+    seed = drawn.first_seed + k
+    rng = np.random.default_rng(seed)
+    maps = _material(found, k, size) if found else procedural_material(seed, size, size)
     if found_rooms:
         n = len(found_rooms)
         room = read_environment(found_rooms[(k + k // n) % n], 256)
         room = rotate_environment(room, float(rng.uniform(0, 2 * np.pi)))
     else:
-        room = procedural_environment(first + k, 256)
+        room = procedural_environment(seed, 256)
     return maps, scale_environment(room, float(rng.uniform(0.1, 1.0))), rng
 
 
 def make_capture(
     folder: Path, maps: Maps, room: Array, rig: Rig, shown: Array, width: int, spp: int, seed: int,
-    quality: int | None = None,
+    quality: int | None = None, noise: float = 0.005,
 ) -> None:  # fmt: skip
     """Simulate a capture whose screen shows ``shown``, times `GAIN`, where it should show the
     default pattern; quality: of a JPEG, exposed for the screen; None for linear EXR."""
@@ -118,7 +132,7 @@ def make_capture(
         new = Path(name) / "capture"
         simulate(
             new, maps, room, shown, rig,
-            gain=GAIN, width=width, spp=spp, noise=0.005, seed=seed,
+            gain=GAIN, width=width, spp=spp, noise=noise, seed=seed,
         )  # fmt: skip
         write_exr(new / "pattern.exr", default_pattern(), half=True)
         if quality:

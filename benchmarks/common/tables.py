@@ -71,8 +71,8 @@ def filled(text: str, folder: Path = RESULTS) -> str:
 
     ``<!-- table: NAME/TABLE -->`` up to ``<!-- end -->`` holds a table of ``tables``, or with
     ``NAME/bars`` the bars; ``<!-- number: FORMAT NAME/key/key -->`` a number, inline, for example
-    ``<!-- number: .0% refine/summaries/network/improved -->``. Raises `InputError` for a block that
-    names nothing, or that does not end.
+    ``<!-- number: .0% refine/summaries/photographs/network/improved -->``. Raises
+    `InputError` for a block that names nothing, or that does not end.
     """
 
     def content(match: re.Match[str]) -> str:
