@@ -133,7 +133,11 @@ def render_ball(folder: Path) -> Array:
                 },
                 "sampler": {"type": "multijitter", "sample_count": SPP},
             },
-            "ball": {"type": "sphere", "bsdf": material},
+            "ball": {
+                "type": "sphere",
+                "bsdf": material,
+                "to_world": transform.rotate([1, 0, 0], -30),  # its pole away from the camera
+            },
             "floor": {
                 "type": "rectangle",
                 "to_world": transform.translate([0, 0, -1]).scale([50, 50, 1]),
