@@ -20,7 +20,7 @@ PARTS = {  # timed inside `make_group`
     "materials": "draw_material",
     "rooms": "draw_environment",
     "light inputs, clues": "light_inputs",
-    "tables": "prepare",
+    "tables": "Fast",
     "sensor": "sensor",
 }
 

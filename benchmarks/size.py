@@ -1,0 +1,234 @@
+"""Time, memory and error of whole processes against the size of the maps, beside another checkout.
+
+Every run is a process of its own, as people start it: seconds, processor seconds and peak memory
+are the process's. ``--against DIR`` names a checkout of the commit to compare with; the two take
+turns, and ratios are medians of the rounds' (ours over theirs). Captures are of the same material
+and room at one size of photo (`benchmarks.common.captures`), whose maps are asked for at all sizes.
+Error is that of the average map: shrunk to 256², against the truth at 256²; and, above 256², of the
+band of details that 256² do not hold, over that of having none. A first run has an empty cache of
+kernels.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.common.captures import PHOTOGRAPHS, arguments, make_captures
+from benchmarks.common.plot import plot_error_over_time
+from benchmarks.common.results import Bar, bar, table, write_results
+from invrender.files.capture import load_capture
+from invrender.files.maps import read_maps
+from invrender.maps import Maps, map_errors, resize_maps
+from invrender.types import Array
+
+HERE = Path(__file__).parents[1]
+SMALL = 256  # pixels a side at which maps of all sizes are compared
+SIZES = (256, 512, 1024, 2048, 4096)
+PHOTO = 3840  # pixels wide
+INVRENDER = ("-m", "invrender")
+EXAMPLE = (*INVRENDER, "refine", "example", "-o", "OUT")
+COMMANDS = {
+    "import invrender": ("-c", "import invrender"),
+    "invrender --help": (*INVRENDER, "--help"),
+    "refine example": EXAMPLE,
+}
+FIRST = "refine example, first run"
+# Seconds over those of the other checkout, and peak GB.
+TIME_BARS = {FIRST: 0.6, "refine example": 0.35, "invrender --help": 0.3,
+             "1024²": 0.3, "2048²": 0.25, "4096²": 0.15}  # fmt: skip
+MEMORY_BARS = {"1024²": 1.2, "2048²": 2.0, "4096²": 4.0}
+
+QUANTITIES = ("seconds", "processor seconds", "GB")
+Cost = dict[str, float]  # of each of these
+
+
+# A process inherits its parent's peak memory until its own is greater: this one is small.
+STARTER = """
+import os, subprocess, sys, time
+start = time.perf_counter()
+process = subprocess.Popen(sys.argv[2:], stdin=subprocess.DEVNULL)
+_, status, usage = os.wait4(process.pid, 0)
+took = time.perf_counter() - start, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 2**20
+with open(sys.argv[1], "w") as file:
+    print(*took, file=file)
+os._exit(os.waitstatus_to_exitcode(status) & 255)
+"""
+
+
+def run(checkout: Path, command: Sequence[str], out: Path, home: Path | None = None) -> Cost:
+    """Run ``python COMMAND`` with a checkout's code, OUT in it being a folder; what it took.
+
+    home: another home folder, where Dr.Jit finds no compiled kernels. Raises `RuntimeError` with
+    the process's last words where it fails.
+    """
+    words = [sys.executable, *(str(out) if word == "OUT" else word for word in command)]
+    env = {**os.environ, "PYTHONPATH": str(checkout), **({"HOME": str(home)} if home else {})}
+    with tempfile.TemporaryDirectory() as name:
+        took = Path(name) / "took"
+        start = [sys.executable, "-S", "-c", STARTER, str(took), *words]
+        done = subprocess.run(start, cwd=checkout, env=env, capture_output=True, text=True)
+        if done.returncode:
+            raise RuntimeError(f"{' '.join(words)}: {(done.stdout + done.stderr)[-500:]}")
+        return dict(zip(QUANTITIES, map(float, took.read_text().split()), strict=True))
+
+
+def detail(maps: Maps, size: int) -> dict[str, Array]:
+    """What maps (n, n) hold beyond ``size``² pixels, encoded, by map."""
+    n = maps.shape[0]
+    coarse = resize_maps(resize_maps(maps, size, size), n, n).encoded()
+    return {name: image - coarse[name] for name, image in maps.encoded().items()}
+
+
+def detail_error(maps: Maps, truth: Maps, size: int = SMALL) -> float:
+    """RMS error of the details beyond ``size``² over that of having none, mean of the four maps.
+
+    A map without details of its own does not count.
+    """
+    found, true = detail(maps, size), detail(truth, size)
+    ratios = []
+    for name, t in true.items():
+        nothing = float(np.mean(t.astype(np.float64) ** 2))
+        if nothing > 1e-10:
+            ratios.append(np.sqrt(np.mean((found[name] - t).astype(np.float64) ** 2) / nothing))
+    return float(np.mean(ratios))
+
+
+def errors(out: Path, truth: Maps) -> dict[str, float]:
+    """Average map RMSE of a result at `SMALL`², and of its details where it is larger."""
+    maps = read_maps(out)
+    n = maps.shape[0]
+    small = [resize_maps(m, min(n, SMALL), min(n, SMALL)) for m in (maps, truth)]
+    found = {"shrunk": map_errors(*small)["average"]}
+    if n > SMALL:
+        found["details"] = detail_error(maps, resize_maps(truth, n, n))
+    return found
+
+
+def parser() -> argparse.ArgumentParser:
+    p = arguments(__doc__, "one small procedural capture at 128² and 512²", 1)
+    p.add_argument("--against", type=Path, help="a checkout of the commit to compare with")
+    p.add_argument("--rounds", type=int, default=5, help="runs of each process (5)")
+    p.add_argument("--sizes", type=int, nargs="+", default=SIZES, help="pixels a side of the maps")
+    return p
+
+
+def main(args: argparse.Namespace) -> None:
+    sizes, rounds = ((128, 512), 1) if args.quick else (args.sizes, args.rounds)
+    shape = (256, 960, 8) if args.quick else (1024, PHOTO, 32)
+    real = (None, None) if args.quick else (args.materials, args.envs)
+    folders = make_captures(args.out / "captures", PHOTOGRAPHS, args.count, *shape, *real)
+    checkouts = {"this checkout": HERE}
+    if args.against:
+        checkouts["the other"] = args.against.resolve()
+    costs: dict[str, dict[str, list[Cost]]] = {}
+    found: dict[str, dict[str, list[dict[str, float]]]] = {}
+    with tempfile.TemporaryDirectory() as name:
+        out = Path(name)
+
+        def turns(what: str, command: Sequence[str], rounds: int, fresh: bool = False) -> None:
+            """Run a command as often as there are rounds with each checkout."""
+            for c, checkout in [*checkouts.items()] * rounds:
+                home = Path(tempfile.mkdtemp(dir=out)) if fresh else None
+                cost = run(checkout, command, out / f"{c} {what}", home)
+                costs.setdefault(what, {}).setdefault(c, []).append(cost)
+                print(what, c, {q: round(v, 2) for q, v in cost.items()}, flush=True)
+
+        for checkout in checkouts.values():
+            run(checkout, EXAMPLE, out / "warm")  # fills the caches
+        for what, command in COMMANDS.items():
+            turns(what, command, rounds)
+        turns(FIRST, EXAMPLE, rounds, fresh=True)
+        for what, n in ((f"{n}²", n) for n in sizes):
+            for folder in folders:
+                truth = load_capture(folder).truth
+                assert truth is not None
+                words = (*INVRENDER, "refine", str(folder.resolve()), "-o", "OUT", "--size", str(n))
+                turns(what, words, rounds)
+                for c in checkouts:
+                    error = errors(out / f"{c} {what}", truth)
+                    found.setdefault(what, {}).setdefault(c, []).append(error)
+    report(args.out, costs, found)
+
+
+def median(costs: list[Cost], what: str) -> float:
+    return statistics.median(cost[what] for cost in costs)
+
+
+def report(out: Path, costs: dict[str, dict[str, list[Cost]]], found: dict[str, Any]) -> None:
+    """Write tables, plot and bars."""
+    checkouts = list(next(iter(costs.values())))
+    medians = {
+        what: {c: {q: median(some, q) for q in QUANTITIES} for c, some in by.items()}
+        for what, by in costs.items()
+    }
+    ratios = {
+        what: statistics.median(
+            a["seconds"] / b["seconds"] for a, b in zip(*by.values(), strict=True)
+        )
+        for what, by in costs.items()
+        if len(by) == 2
+    }
+    means = {
+        size: {
+            c: {e: float(np.mean([f[e] for f in some])) for e in some[0]} for c, some in by.items()
+        }
+        for size, by in found.items()
+    }
+    rows = [
+        [
+            what,
+            *(by[c][q] for c in checkouts for q in QUANTITIES),
+            *([ratios[what]] if ratios else []),
+        ]
+        for what, by in medians.items()
+    ]
+    header = ["", *(f"{q}, {c}" for c in checkouts for q in QUANTITIES)]
+    tables = {
+        "processes": table([*header, *(["seconds, ratio"] if ratios else [])], rows),
+        "errors": table(
+            ["maps of", *(f"{c}: {e}" for c in checkouts for e in ("shrunk to 256²", "details"))],
+            [[size, *(by[c].get(e) for c in checkouts for e in ("shrunk", "details"))]
+             for size, by in means.items()],
+        ),
+    }  # fmt: skip
+    sizes = [int(size[:-1]) for size in found]
+    panels: dict[str, Any] = {
+        q: {c: (sizes, [medians[f"{n}²"][c][q] for n in sizes]) for c in checkouts}
+        for q in QUANTITIES
+    }
+    panels["average map RMSE, shrunk to 256²"] = {
+        c: (sizes, [means[f"{n}²"][c]["shrunk"] for n in sizes]) for c in checkouts
+    }
+    plot_error_over_time(out / "size.png", panels, x="pixels a side", y="", columns=2)
+    results = {"medians": medians, "ratios": ratios, "errors": means}
+    write_results(out, {**results, "costs": costs, "bars": bars(results)}, tables)
+
+
+def bars(results: dict[str, Any]) -> list[Bar]:
+    """What was measured beside its bar; ratios only where there was another checkout."""
+    medians, means = results["medians"], results["errors"]
+    found = [
+        bar(f"{what}: seconds over the other checkout's", results["ratios"][what], most, False)
+        for what, most in TIME_BARS.items()
+        if what in results["ratios"]
+    ]
+    ours = {what: by["this checkout"] for what, by in medians.items()}
+    found += [bar(f"{what}: GB", ours[what]["GB"], most, False)
+              for what, most in MEMORY_BARS.items() if what in ours]  # fmt: skip
+    small, large = (means.get(f"{n}²", {}).get("this checkout") for n in (SMALL, 1024))
+    if small and large:
+        ratio = large["shrunk"] / small["shrunk"]
+        found.append(bar("average error at 1024², shrunk, over that at 256²", ratio, 1.03, False))
+    if large:
+        found.append(bar("details at 1024² over none", large["details"], 0.8, False))
+    return found
