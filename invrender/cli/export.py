@@ -13,14 +13,17 @@ if TYPE_CHECKING:
 
     from invrender.export import Exported
 
-TARGETS = ("gltf", "materialx", "blender", "unreal", "unity", "mitsuba")
+TARGETS = (
+    "gltf", "usd", "materialx", "blender", "unreal", "unity", "godot", "ambientcg", "polyhaven",
+    "mitsuba",
+)  # fmt: skip
 
 
 def add_parser(commands: Any) -> None:
     """Add the subcommand to argparse's subparsers."""
     parser = commands.add_parser(
         "export",
-        help="write a result for glTF, MaterialX, Blender, Unreal, Unity or Mitsuba",
+        help="write a result for glTF, USD, MaterialX, Blender, game engines or Mitsuba",
         description="Write a result's maps in the form that another program reads, and say what "
         "the conversion costs: the error of the maps, and of their re-rendering, as a reader of "
         "the files sees them.",
@@ -30,13 +33,17 @@ def add_parser(commands: Any) -> None:
     )
     parser.add_argument("--to", required=True, choices=TARGETS, help="what to write")
     parser.add_argument(
-        "-o", "--out", type=Path, required=True, help="a .glb file for gltf, a folder for the rest"
+        "-o",
+        "--out",
+        type=Path,
+        required=True,
+        help="a .glb file for gltf, a .usdz file or a folder for usd, a folder for the rest; or "
+        "a .zip file",
     )
     parser.add_argument(
         "--format",
         choices=("png8", "png16", "exr", "jpeg"),
-        help="of the textures; gltf: png8 (default) or jpeg; materialx, mitsuba: exr; blender: "
-        "png16; unreal, unity: png8",
+        help="of the textures (gltf: png8, or jpeg; materialx and mitsuba: exr; the rest: png16)",
     )
     parser.add_argument(
         "--normal-convention",
@@ -45,12 +52,15 @@ def add_parser(commands: Any) -> None:
     )
     parser.add_argument("--tileable", action="store_true", help="make the maps seamless")
     parser.add_argument(
-        "--height", action="store_true", help="add a height map, integrated from the normals"
+        "--height",
+        action="store_true",
+        help="add a height map, integrated from the normals, and ambient occlusion",
     )
     parser.add_argument("--name", help="of the material and its files (the capture's)")
     parser.add_argument(
         "--width", type=float, metavar="METRES", help="of the sample (what the result says)"
     )
+    parser.add_argument("--licence", help="for material.json, beside the files")
     parser.add_argument("--json", action="store_true", help="print what was written as JSON")
     parser.set_defaults(run=run)
 
@@ -70,6 +80,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
             width=args.width,
             tileable=args.tileable,
             height=args.height,
+            licence=args.licence,
         )
     if args.json:
         print(json.dumps(asdict(done)))

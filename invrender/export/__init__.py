@@ -11,20 +11,29 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from invrender.data.materials import read_material
-from invrender.export.folders import write_blender, write_unity, write_unreal
-from invrender.export.gltf import write_gltf
+from invrender.export.folders import (
+    write_ambientcg,
+    write_blender,
+    write_godot,
+    write_polyhaven,
+    write_unity,
+    write_unreal,
+)
+from invrender.export.gltf import move_glb, write_gltf
 from invrender.export.height import height_from_normals
 from invrender.export.material import Material, height_range
 from invrender.export.materialx import write_materialx
 from invrender.export.mitsuba import write_mitsuba
-from invrender.export.textures import safe_name
+from invrender.export.textures import safe_name, whole_folder, write_zip
 from invrender.export.tileable import make_tileable
+from invrender.export.usd import write_usd, write_usdz
 from invrender.files.images import read_image
 from invrender.maps import Maps, map_errors
 from invrender.rig import Rig
@@ -38,23 +47,38 @@ CHECKED = 256  # pixels a side that are re-rendered at most
 
 @dataclass(frozen=True)
 class Target:
-    """formats, conventions: what it can hold, the default first. height: it has a place for one."""
+    """What writes a target's files into a folder, and what they can hold, the defaults first.
+
+    height: there is a place for one. single: the ending of the file of its own that it can be, if
+    any; folder: it can also be a folder. Every target can be a ``.zip``.
+    """
 
     write: Callable[[Material, Path, str, str], dict[str, Maps]]
-    formats: tuple[str, ...]
+    formats: tuple[str, ...] = ("png16", "png8", "exr", "jpeg")
     conventions: tuple[str, ...] = CONVENTIONS
     height: bool = True
-    file: bool = False  # one file rather than a folder
+    single: str | None = None
+    folder: bool = True
 
 
 TARGETS = {
-    "gltf": Target(write_gltf, ("png8", "jpeg"), ("opengl",), height=False, file=True),
+    "gltf": Target(
+        write_gltf, ("png8", "jpeg"), ("opengl",), height=False, single=".glb", folder=False
+    ),
+    "usd": Target(write_usd, conventions=("opengl",), single=".usdz"),
     "materialx": Target(write_materialx, ("exr", "png16", "png8", "jpeg"), ("opengl",)),
-    "blender": Target(write_blender, ("png16", "png8", "exr", "jpeg")),
-    "unreal": Target(write_unreal, ("png16", "png8", "exr", "jpeg"), ("directx", "opengl")),
+    "blender": Target(write_blender),
+    "unreal": Target(write_unreal, conventions=("directx", "opengl")),
     "unity": Target(write_unity, ("png16", "png8", "exr")),
+    "godot": Target(write_godot, conventions=("opengl",)),
+    "ambientcg": Target(write_ambientcg),
+    "polyhaven": Target(write_polyhaven),
     "mitsuba": Target(write_mitsuba, ("exr",), ("opengl",), height=False),
 }
+
+
+# What becomes of the folder of files for an output of each ending.
+PACKERS = {".glb": move_glb, ".usdz": write_usdz, ".zip": write_zip}
 
 
 @dataclass
@@ -111,12 +135,16 @@ def export_maps(
     width: float | None = None,
     tileable: bool = False,
     height: bool = False,
+    licence: str | None = None,
     environment: Array | None = None,
 ) -> Exported:
-    """Write maps for a target of `TARGETS` to ``out``: a .glb file for glTF, else a folder.
+    """Write maps for a target of `TARGETS` to ``out``: a .glb file for glTF, a .usdz file or a
+    folder for USD, a folder for the others, or a .zip file for any.
 
     width: of the sample, metres. tileable: make the maps seamless. height: integrate the normals
-    to a height map. Raises `InputError` for what the target cannot hold; nothing is written then.
+    to a height map, and that to ambient occlusion. licence: for ``material.json``, which stands
+    beside the files of a folder or .zip and holds the sizes. Raises `InputError` for what the
+    target cannot hold; nothing is written then.
     """
     kind = TARGETS.get(target)
     if kind is None:
@@ -148,7 +176,12 @@ def export_maps(
     material = Material(
         safe_name(name), maps, width, relief.height if relief else None, environment
     )
-    seen = kind.write(material, out, format, convention)
+    suffix = out.suffix.lower()
+    with whole_folder(out, PACKERS.get(suffix)) as folder:
+        seen = kind.write(material, folder, format, convention)
+        if suffix not in (".glb", ".usdz"):
+            facts = _facts(material, target, format, convention, licence)
+            (folder / "material.json").write_text(json.dumps(facts, indent=1), encoding="utf-8")
     lap("write")
     errors = {
         key: {**map_errors(back, maps), "rerender": rerender_error(back, maps)}
@@ -184,14 +217,36 @@ def _one_of(target: str, what: str, value: str | None, known: tuple[str, ...]) -
 
 
 def _check_out(out: Path, kind: Target, target: str) -> None:
-    if kind.file and out.suffix.lower() != ".glb":
-        raise InputError(f"{out}: {target} is written as one .glb file")
-    if kind.file and out.is_dir():
-        raise InputError(f"{out} is a folder; choose a file")
-    if not kind.file and out.exists() and not out.is_dir():
+    endings = [ending for ending in (kind.single, ".zip") if ending]
+    if out.suffix.lower() in endings:
+        if out.is_dir():
+            raise InputError(f"{out} is a folder; choose a file")
+        if not out.resolve().parent.is_dir():
+            raise InputError(f"{out.parent} is not a folder")
+    elif not kind.folder:
+        raise InputError(f"{out}: {target} is written as one {' or '.join(endings)} file")
+    elif out.suffix.lower() in PACKERS:
+        raise InputError(f"{out}: {target} cannot be written as a {out.suffix} file")
+    elif out.exists() and not out.is_dir():
         raise InputError(f"{out} is a file; choose a folder")
-    if kind.file and not out.resolve().parent.is_dir():
-        raise InputError(f"{out.parent} is not a folder")
+
+
+def _facts(
+    material: Material, target: str, format: str, convention: str, licence: str | None
+) -> dict[str, Any]:
+    """What the textures alone do not tell; lengths in metres."""
+    facts: dict[str, Any] = {
+        "name": material.name,
+        "licence": licence,
+        "generator": f"invrender {version('invrender')}",
+        "target": target,
+        "format": format,
+        "normal_convention": convention,
+        "sides": list(material.sides),
+    }
+    if material.height is not None:
+        facts["height"] = dict(zip(("black", "white"), height_range(material.height), strict=True))
+    return facts
 
 
 def _report(path: Path) -> dict[str, Any]:

@@ -9,6 +9,7 @@ way viewers look at a model; the sample's +y is up.
 from __future__ import annotations
 
 import json
+import os
 import struct
 from importlib.metadata import version
 from pathlib import Path
@@ -19,7 +20,6 @@ import numpy as np
 from invrender.export.material import Material, normal_texture, normals_seen
 from invrender.export.metalrough import F0, MetalRough, maps_of, metal_rough, with_coloured_f0
 from invrender.export.textures import Texture, encoded
-from invrender.files.write import atomic_path
 from invrender.maps import Maps
 from invrender.types import Array
 
@@ -28,8 +28,8 @@ ARRAY_BUFFER, ELEMENT_BUFFER = 34962, 34963
 WORST_DIFFUSE = 0.005  # RMSE of k_d above which the material is written without metal
 
 
-def write_gltf(material: Material, out: Path, format: str, convention: str) -> dict[str, Maps]:
-    """Write the .glb; returns the maps that a viewer sees, with the extension and without it.
+def write_gltf(material: Material, folder: Path, format: str, convention: str) -> dict[str, Maps]:
+    """Write ``NAME.glb``; returns the maps that a viewer sees, with the extension and without it.
 
     Metalness, base colour and f0 are rounded to bytes one after the other, each making up for the
     rounding before it. A material that no metalness suits is written with metallic = 0, all of k_s
@@ -48,7 +48,8 @@ def write_gltf(material: Material, out: Path, format: str, convention: str) -> d
         "specular": Texture(np.clip(needed / scale, 0, 1), colour=True),
     }
     files = {key: encoded(texture, format) for key, texture in textures.items()}
-    _write_glb(material, out, {k: data for k, (data, _) in files.items()}, format, scale)
+    path = folder / f"{material.name}.glb"
+    _write_glb(material, path, {k: data for k, (data, _) in files.items()}, format, scale)
     seen = {k: image for k, (_, image) in files.items()}
     rough, metal = seen["orm"][..., 1], seen["orm"][..., 2]
     normal = normals_seen(seen["normal"], convention)
@@ -59,6 +60,12 @@ def write_gltf(material: Material, out: Path, format: str, convention: str) -> d
             MetalRough(seen["base"], metal, np.full_like(metal, F0)), rough, normal
         ),
     }
+
+
+def move_glb(folder: Path, out: Path) -> None:
+    """Move the one ``.glb`` of a folder."""
+    (file,) = folder.glob("*.glb")
+    os.replace(file, out)
 
 
 def _split(maps: Maps, format: str) -> MetalRough:
@@ -84,7 +91,7 @@ def _rough_metal(roughness: Array, metallic: Array) -> Texture:
 
 
 def _write_glb(
-    material: Material, out: Path, images: dict[str, bytes], format: str, scale: float
+    material: Material, path: Path, images: dict[str, bytes], format: str, scale: float
 ) -> None:
     w, h = (s / 2 for s in material.sides)
     corners = np.array([[-w, -h, 0], [w, -h, 0], [w, h, 0], [-w, h, 0]], "<f4")
@@ -145,7 +152,7 @@ def _write_glb(
     }  # fmt: skip
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
-    with atomic_path(out) as temporary, open(temporary, "wb") as f:
+    with path.open("wb") as f:
         f.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(blob)))
         f.write(struct.pack("<I4s", len(text), b"JSON") + text)
         f.write(struct.pack("<I4s", len(blob), b"BIN\0") + blob)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
+from invrender.export.occlusion import ambient_occlusion
 from invrender.export.textures import Texture
 from invrender.maps import Maps
 from invrender.types import Array
@@ -27,6 +29,13 @@ class Material:
         """Width and height of the sample in metres; pixels are square."""
         rows, columns = self.maps.shape
         return self.width, self.width * rows / columns
+
+    @cached_property
+    def occlusion(self) -> Array:
+        """(H, W): ambient occlusion of the height, 1 where there is none."""
+        if self.height is None:
+            return np.ones(self.maps.shape, np.float32)
+        return ambient_occlusion(self.height, self.width / self.maps.shape[1])
 
 
 def normal_texture(normal: Array, convention: str) -> Texture:

@@ -1,14 +1,17 @@
 """MaterialX (.mtlx) with its textures, written and validated by the MaterialX library.
 
-Two materials share the textures. NAME is our BRDF in MaterialX's own closures: a Lambertian plus a
-generalised Schlick lobe with F0 = k_s, F90 = 1 and GGX of α = ρ². NAME_standard_surface is for
-renderers that know only Autodesk's Standard Surface; it is metal-rough.
+Three materials share the textures. NAME is our BRDF in MaterialX's own closures: a Lambertian plus
+a generalised Schlick lobe with F0 = k_s, F90 = 1 and GGX of α = ρ². NAME_open_pbr (OpenPBR 1.1) and
+NAME_standard_surface (Autodesk's, for older renderers) are metal-rough; OpenPBR's specular weight
+holds the dielectric part's f0 per pixel.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from invrender.export.material import (
     Material,
@@ -17,13 +20,22 @@ from invrender.export.material import (
     normal_texture,
     normals_seen,
 )
-from invrender.export.metalrough import MetalRough, maps_of, metal_rough
-from invrender.export.textures import SUFFIXES, Texture, safe_name, whole_folder, write_textures
+from invrender.export.metalrough import (
+    F0,
+    WHITE_F0,
+    WHITE_IOR,
+    MetalRough,
+    maps_of,
+    with_grey_f0,
+)
+from invrender.export.textures import SUFFIXES, Texture, write_textures
 from invrender.maps import Maps
 from invrender.types import InputError
 
 
-def write_materialx(material: Material, out: Path, format: str, convention: str) -> dict[str, Maps]:
+def write_materialx(
+    material: Material, folder: Path, format: str, convention: str
+) -> dict[str, Maps]:
     """Write ``NAME.mtlx`` and its textures; raises `InputError` without the materialx package."""
     try:
         import MaterialX as mx
@@ -31,8 +43,8 @@ def write_materialx(material: Material, out: Path, format: str, convention: str)
         raise InputError(
             "MaterialX files need the materialx package: pip install 'invrender[export]'"
         ) from None
-    maps, name = material.maps, safe_name(material.name)
-    mr = metal_rough(maps)
+    maps, name = material.maps, material.name
+    mr = with_grey_f0(maps, WHITE_F0)
     textures = {
         f"{name}_diffuse": Texture(maps.diffuse, colour=True),
         f"{name}_specular": Texture(maps.specular, colour=True),
@@ -40,21 +52,24 @@ def write_materialx(material: Material, out: Path, format: str, convention: str)
         f"{name}_normal": normal_texture(maps.normal, convention),
         f"{name}_base": Texture(mr.base, colour=True),
         f"{name}_metalness": Texture(mr.metallic),
+        f"{name}_specular_weight": Texture(mr.f0 / WHITE_F0),
     }
     if material.height is not None:
         textures[f"{name}_height"] = height_texture(material.height)
-    with whole_folder(out) as folder:
-        document = _document(mx, material, name, format)
-        valid, message = document.validate()
-        if not valid:
-            raise RuntimeError(f"the MaterialX document is not valid: {message}")
-        mx.writeToXmlFile(document, str(folder / f"{name}.mtlx"), _own_elements(mx))
-        seen = write_textures(folder, textures, format)
-    diffuse, specular, rough, normal, base, metal = (seen[k] for k in list(textures)[:6])
+    document = _document(mx, material, name, format)
+    valid, message = document.validate()
+    if not valid:
+        raise RuntimeError(f"the MaterialX document is not valid: {message}")
+    mx.writeToXmlFile(document, str(folder / f"{name}.mtlx"), _own_elements(mx))
+    seen = write_textures(folder, textures, format, material.width)
+    diffuse, specular, rough, normal, base, metal, weight = (seen[k] for k in list(textures)[:7])
     n = normals_seen(normal, convention)
     return {
         name: Maps(diffuse, specular, rough, n),
-        f"{name}_standard_surface": maps_of(MetalRough(base, metal, mr.f0), rough, n),
+        f"{name}_open_pbr": maps_of(MetalRough(base, metal, weight * WHITE_F0), rough, n),
+        f"{name}_standard_surface": maps_of(
+            MetalRough(base, metal, np.full_like(metal, F0)), rough, n
+        ),
     }
 
 
@@ -86,7 +101,7 @@ def _document(mx: Any, material: Material, name: str, format: str) -> Any:
 
     for key in ("diffuse", "specular", "base"):
         output(key, image(key, "color3", colour=True), "color3")
-    for key in ("roughness", "metalness"):
+    for key in ("roughness", "metalness", "specular_weight"):
         output(key, image(key, "float"), "float")
     normal = graph.addNode("normalmap", "normalmap", "vector3")
     normal.setConnectedNode("in", image("normal", "vector3"))
@@ -123,7 +138,14 @@ def _document(mx: Any, material: Material, name: str, format: str) -> Any:
     connect(standard, base_color="base", metalness="metalness", specular_roughness="roughness",
             normal="normal")  # fmt: skip
     standard.setInputValue("base", 1.0, "float")
-    for key, shader in ((name, surface), (f"{name}_standard_surface", standard)):
+    open_pbr = document.addNode("open_pbr_surface", f"{name}_open_pbr_surface", "surfaceshader")
+    connect(open_pbr, base_color="base", base_metalness="metalness", geometry_normal="normal",
+            specular_roughness="roughness", specular_weight="specular_weight")  # fmt: skip
+    open_pbr.setInputValue("specular_ior", WHITE_IOR, "float")
+    for suffix, shader in (
+        ("", surface), ("_open_pbr", open_pbr), ("_standard_surface", standard)
+    ):  # fmt: skip
+        key = name + suffix
         node = document.addMaterialNode(key, shader)
         if displacement is not None:
             node.setConnectedNode("displacementshader", displacement)

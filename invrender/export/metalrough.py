@@ -16,6 +16,9 @@ from invrender.maps import Maps
 from invrender.types import Array
 
 F0 = 0.04  # of a dielectric with a refractive index of 1.5
+# Reflectance of "specular" = 1 in Unreal and of "specular IOR level" = 1 in Blender.
+WHITE_F0 = 0.08
+WHITE_IOR = (1 + WHITE_F0**0.5) / (1 - WHITE_F0**0.5)  # the refractive index of it
 
 
 @dataclass
@@ -51,7 +54,7 @@ def metal_rough(maps: Maps) -> MetalRough:
     return MetalRough(base, m, np.full(m.shape, F0, np.float32))
 
 
-def with_grey_f0(maps: Maps, highest: float = 0.08) -> MetalRough:
+def with_grey_f0(maps: Maps, highest: float = WHITE_F0) -> MetalRough:
     """As `metal_rough`, with the dielectric's f0 in [0, highest] per pixel, as Unreal's and
     Blender's "specular" set it."""
     mr = metal_rough(maps)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from invrender.export.material import Material, normal_texture, normals_seen
-from invrender.export.textures import Texture, whole_folder, write_textures
+from invrender.export.textures import Texture, write_textures
 from invrender.maps import Maps
 from invrender.rig import Rig
 from invrender.sphere import mitsuba_rows
@@ -74,7 +74,9 @@ WHITE = """\
   <emitter type="constant"><rgb name="radiance" value="1"/></emitter>"""
 
 
-def write_mitsuba(material: Material, out: Path, format: str, convention: str) -> dict[str, Maps]:
+def write_mitsuba(
+    material: Material, folder: Path, format: str, convention: str
+) -> dict[str, Maps]:
     """Write ``scene.xml``, its EXR textures and, where it is known, ``environment.exr``."""
     maps = material.maps
     textures = {
@@ -85,9 +87,8 @@ def write_mitsuba(material: Material, out: Path, format: str, convention: str) -
     }
     if material.environment is not None:
         textures["environment"] = Texture(mitsuba_rows(material.environment))
-    with whole_folder(out) as folder:
-        (folder / "scene.xml").write_text(_scene(material), encoding="utf-8")
-        seen = write_textures(folder, textures, format)
+    (folder / "scene.xml").write_text(_scene(material), encoding="utf-8")
+    seen = write_textures(folder, textures, format)
     diffuse, specular = seen["diffuse_x2"] / 2, seen["specular_x2"] / 2
     normal = normals_seen(seen["normal"], convention)
     return {"scene": Maps(diffuse, specular, np.sqrt(seen["alpha"]), normal)}

@@ -7,8 +7,9 @@ import os
 import re
 import struct
 import tempfile
+import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,11 +18,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageCms
+from PIL.PngImagePlugin import putchunk
 
 from invrender.colour import linear_to_srgb, srgb_to_linear
-from invrender.files.write import atomic_path, write_exr
-from invrender.types import Array
+from invrender.files.write import INCH, atomic_path, png_tags, write_exr
+from invrender.types import Array, InputError
 
 SUFFIXES = {"png8": ".png", "png16": ".png", "exr": ".exr", "jpeg": ".jpg"}
 JPEG_QUALITY = 95
@@ -57,56 +59,93 @@ def reals(codes: NDArray[Any], levels: int, colour: bool) -> Array:
     return np.concatenate([linear, table[codes[..., 3:]]], -1) if codes.shape[-1] == 4 else linear
 
 
-def encoded(texture: Texture, format: str) -> tuple[bytes, Array]:
-    """The bytes of a PNG or JPEG file, and the linear image that a reader gets from it."""
+def encoded(texture: Texture, format: str, width: float | None = None) -> tuple[bytes, Array]:
+    """The bytes of a PNG or JPEG file, and the linear image that a reader gets from it.
+
+    The file says whether it is sRGB or data, and, with its ``width`` in metres, how large a pixel
+    is (PNG: sRGB or gAMA, pHYs; JPEG: an ICC profile where it is a colour, JFIF's density).
+    """
+    columns = texture.image.shape[1]
     if format == "png16":
         codes = integers(texture, 65535)
-        return _png16(codes), reals(codes, 65535, texture.colour)
+        return _png16(codes, texture.colour, width), reals(codes, 65535, texture.colour)
     codes = integers(texture, 255)
     stream = io.BytesIO()
     picture = Image.fromarray(codes.astype(np.uint8))
+    inch: dict[str, Any] = {} if width is None else {"dpi": (columns * INCH / width,) * 2}
     if format == "png8":
-        picture.save(stream, format="PNG", compress_level=1)
+        picture.save(
+            stream, format="PNG", compress_level=1, pnginfo=png_tags(texture.colour), **inch
+        )
         return stream.getvalue(), reals(codes, 255, texture.colour)
-    picture.save(stream, format="JPEG", quality=JPEG_QUALITY, subsampling=0)
+    if texture.colour:
+        inch["icc_profile"] = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    picture.save(stream, format="JPEG", quality=JPEG_QUALITY, subsampling=0, **inch)
     with Image.open(stream) as back:
         seen = np.asarray(back)
     return stream.getvalue(), reals(seen, 255, texture.colour)
 
 
-def write_texture(path: Path, texture: Texture, format: str) -> Array:
+def write_texture(path: Path, texture: Texture, format: str, width: float | None = None) -> Array:
     """Write one file, whole or not at all; returns the linear image that a reader gets from it."""
     if not np.all(np.isfinite(texture.image)):
         raise ValueError(f"refusing to write non-finite values to {path}")
     if format == "exr":
-        write_exr(path, texture.image)
+        write_exr(path, texture.image, data=not texture.colour, width=width)
         return np.asarray(texture.image, np.float32)
-    data, seen = encoded(texture, format)
+    data, seen = encoded(texture, format, width)
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
     return seen
 
 
-def write_textures(folder: Path, textures: dict[str, Texture], format: str) -> dict[str, Array]:
-    """Write ``KEY.suffix`` for each texture, in threads; returns what readers get, by key."""
+def write_textures(
+    folder: Path, textures: dict[str, Texture], format: str, width: float | None = None
+) -> dict[str, Array]:
+    """Write ``KEY.suffix`` for each texture, in threads; returns what readers get, by key.
+
+    width: of what the textures show, metres.
+    """
     suffix = SUFFIXES[format]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         jobs = {
-            key: pool.submit(write_texture, folder / f"{key}{suffix}", texture, format)
+            key: pool.submit(write_texture, folder / f"{key}{suffix}", texture, format, width)
             for key, texture in textures.items()
         }
         return {key: job.result() for key, job in jobs.items()}
 
 
 @contextmanager
-def whole_folder(out: Path) -> Iterator[Path]:
-    """A temporary folder whose files move to ``out`` when the block ends without an error."""
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=out.parent, prefix=".") as name:
-        yield Path(name)
-        out.mkdir(exist_ok=True)
-        for file in sorted(Path(name).iterdir()):
-            os.replace(file, out / file.name)
+def whole_folder(out: Path, pack: Callable[[Path, Path], None] | None = None) -> Iterator[Path]:
+    """A temporary folder whose files move to ``out`` when the block ends without an error.
+
+    pack: makes the one file ``out`` of the folder instead. Raises `InputError` where the system
+    does not let them be written.
+    """
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=out.parent, prefix=".") as name:
+            yield Path(name)
+            if pack is not None:
+                with atomic_path(out) as temporary:
+                    pack(Path(name), temporary)
+                return
+            out.mkdir(exist_ok=True)
+            for file in sorted(Path(name).iterdir()):
+                os.replace(file, out / file.name)
+    except OSError as error:
+        raise InputError(
+            f"{out} cannot be written: {error.strerror or 'the system refuses it'}"
+        ) from None
+
+
+def write_zip(folder: Path, out: Path) -> None:
+    """Pack the files of a folder into a ``.zip``; images are compressed already."""
+    with zipfile.ZipFile(out, "w") as archive:
+        for file in sorted(folder.iterdir()):
+            image = file.suffix in SUFFIXES.values()
+            kind = zipfile.ZIP_STORED if image else zipfile.ZIP_DEFLATED
+            archive.write(file, file.name, kind)
 
 
 def safe_name(text: str) -> str:
@@ -114,24 +153,22 @@ def safe_name(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9_-]+", "_", text).strip("_")[:64] or "material"
 
 
-def _png16(codes: NDArray[np.uint16]) -> bytes:
+def _png16(codes: NDArray[np.uint16], colour: bool, width: float | None) -> bytes:
     """A 16-bit PNG (Pillow writes colour with 8 bits only). W3C PNG 3rd ed.; filter 2, "Up"."""
-    height, width = codes.shape[:2]
+    rows, columns = codes.shape[:2]
     kind = {1: 0, 3: 2, 4: 6}[codes.shape[2] if codes.ndim == 3 else 1]
-    rows = np.ascontiguousarray(codes.astype(">u2")).view(np.uint8).reshape(height, -1)
-    lines = np.full((height, rows.shape[1] + 1), 2, np.uint8)
-    lines[0, 1:] = rows[0]
-    np.subtract(rows[1:], rows[:-1], out=lines[1:, 1:])
-
-    def chunk(name: bytes, data: bytes) -> bytes:
-        return (
-            struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
-        )
-
-    header = struct.pack(">IIBBBBB", width, height, 16, kind, 0, 0, 0)
-    parts = (
-        chunk(b"IHDR", header),
-        chunk(b"IDAT", zlib.compress(lines.tobytes(), 1)),
-        chunk(b"IEND", b""),
-    )
-    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+    values = np.ascontiguousarray(codes.astype(">u2")).view(np.uint8).reshape(rows, -1)
+    lines = np.full((rows, values.shape[1] + 1), 2, np.uint8)
+    lines[0, 1:] = values[0]
+    np.subtract(values[1:], values[:-1], out=lines[1:, 1:])
+    out = io.BytesIO(b"\x89PNG\r\n\x1a\n")
+    out.seek(0, io.SEEK_END)
+    putchunk(out, b"IHDR", struct.pack(">IIBBBBB", columns, rows, 16, kind, 0, 0, 0))
+    for name, data, *_ in png_tags(colour).chunks:
+        putchunk(out, name, data)
+    if width is not None:
+        density = round(columns / width)  # pixels a metre
+        putchunk(out, b"pHYs", struct.pack(">IIB", density, density, 1))
+    putchunk(out, b"IDAT", zlib.compress(lines.tobytes(), 1))
+    putchunk(out, b"IEND", b"")
+    return out.getvalue()

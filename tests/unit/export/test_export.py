@@ -2,7 +2,10 @@
 
 import io
 import json
+import shutil
+import subprocess
 import xml.etree.ElementTree as ET
+import zipfile
 
 import numpy as np
 import OpenEXR
@@ -11,9 +14,15 @@ from PIL import Image
 
 from invrender.cli.main import main
 from invrender.colour import srgb_to_linear
-from invrender.data.materials import procedural_material
+from invrender.data.materials import procedural_material, read_material
 from invrender.export import TARGETS, export, export_maps, rerender_error
-from invrender.export.metalrough import maps_of, metal_rough, metallic, with_coloured_f0
+from invrender.export.metalrough import (
+    MetalRough,
+    maps_of,
+    metal_rough,
+    metallic,
+    with_coloured_f0,
+)
 from invrender.export.textures import safe_name
 from invrender.files.images import read_image
 from invrender.files.maps import write_maps
@@ -89,7 +98,8 @@ def test_materialx_is_valid_and_lossless(maps, tmp_path):
     mx.readFromXmlFile(document, str(tmp_path / "m" / "rust.mtlx"))
     document.setDataLibrary(library)
     assert document.validate()[0]
-    assert {m.getName() for m in document.getMaterialNodes()} == {"rust", "rust_standard_surface"}
+    names = {m.getName() for m in document.getMaterialNodes()}
+    assert names == {"rust", "rust_open_pbr", "rust_standard_surface"}
 
     def image(key):
         node = document.getNodeGraph("NG_rust").getNode(f"image_{key}")
@@ -97,6 +107,17 @@ def test_materialx_is_valid_and_lossless(maps, tmp_path):
 
     back = Maps(image("diffuse"), image("specular"), image("roughness"), decode(image("normal")))
     assert rerender_error(back, maps) < 1e-4
+    # OpenPBR 1.1: F0 = specular_weight · ((ior - 1) / (ior + 1))² of the dielectric base.
+    shader = document.getNode("rust_open_pbr_surface")
+    assert shader.getCategory() == "open_pbr_surface"
+    ior = shader.getInputValue("specular_ior")
+    f0 = image("specular_weight") * ((ior - 1) / (ior + 1)) ** 2
+    open_pbr = maps_of(MetalRough(image("base"), image("metalness"), f0), back.roughness,
+                       back.normal)  # fmt: skip
+    assert done.errors["rust_open_pbr"]["rerender"] == pytest.approx(
+        rerender_error(open_pbr, maps), abs=1e-5
+    )
+    assert done.errors["rust_open_pbr"]["rerender"] < 0.01
     assert image("height").min() == 0 and image("height").max() == pytest.approx(1)
     assert done.height["white"] > 0 > done.height["black"]
 
@@ -132,7 +153,7 @@ def test_unity_specular_workflow(maps, tmp_path):
 
 def test_blender_names_and_16_bits(maps, tmp_path):
     export_maps(maps, tmp_path / "b", "blender", name="rust")
-    names = {p.stem.split("_")[1] for p in (tmp_path / "b").iterdir()}
+    names = {p.stem.split("_")[1] for p in (tmp_path / "b").glob("*.png")}
     assert names == {"BaseColor", "Metallic", "Specular", "Roughness", "Normal"}
     # 16 bits, as Pillow reads grey ones.
     with Image.open(tmp_path / "b" / "rust_Roughness.png") as image:
@@ -243,7 +264,7 @@ def test_names_from_files_stay_in_the_folder(maps, tmp_path):
     assert done.width > 0
     export(source, tmp_path / "blender", "blender")
     assert {p.name for p in tmp_path.iterdir()} == {"source", "out", "blender"}
-    assert all("evil_script" in p.name for p in (tmp_path / "blender").iterdir())
+    assert all("evil_script" in p.name for p in (tmp_path / "blender").glob("rust*"))
     assert "script" not in (tmp_path / "out" / "scene.xml").read_text()
 
 
@@ -258,3 +279,127 @@ def test_command(maps, tmp_path, capsys):
     assert main(["export", str(source), "--to", "gltf", "-o", str(tmp_path / "m.txt")]) == 2
     assert main(["export", str(tmp_path / "none"), "--to", "unity", "-o", str(tmp_path / "u")]) == 2
     assert {p.name for p in tmp_path.iterdir()} == {"source", "m.glb"}
+
+
+def test_glb_passes_khronos_validator(maps, tmp_path):
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("Khronos' validator needs node")
+    package = tmp_path / "npm"
+    command = ["npm", "install", "--silent", "--prefix", package, "gltf-validator@2.0.0-dev.3.10"]
+    if subprocess.run(command, capture_output=True, timeout=120).returncode:
+        pytest.skip("npm cannot fetch Khronos' validator")
+    script = (
+        "require('gltf-validator').validateBytes(require('fs').readFileSync(process.argv[1]))"
+        ".then(report => console.log(JSON.stringify(report.issues)))"
+    )
+    for format in TARGETS["gltf"].formats:
+        export_maps(maps, tmp_path / "m.glb", "gltf", format=format)
+        done = subprocess.run(
+            [node, "-e", script, tmp_path / "m.glb"], cwd=package, capture_output=True, text=True
+        )
+        assert json.loads(done.stdout)["messages"] == []
+
+
+@pytest.mark.parametrize("name", ["m.usdz", "m"])
+def test_usd_is_valid(maps, tmp_path, name):
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdGeom, UsdShade, UsdValidation
+
+    done = export_maps(maps, tmp_path / name, "usd", name="3rust", width=0.1, height=True)
+    stage = Usd.Stage.Open(str(tmp_path / name / "3rust.usda" if name == "m" else tmp_path / name))
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1
+    assert UsdGeom.GetStageUpAxis(stage) == "Y"
+    box = UsdGeom.Imageable(stage.GetDefaultPrim()).ComputeWorldBound(0, "default").GetRange()
+    assert np.allclose(box.GetSize(), [0.1, 0.1, 0])
+    everything = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    errors = UsdValidation.ValidationContext(everything).Validate(stage)
+    # The wheel of USD comes without MaterialX's nodes; the next lines look for these themselves.
+    unknown = [e for e in errors if e.GetName() == "MissingShaderIdInRegistry"]
+    assert [e.GetMessage() for e in errors if e not in unknown] == []
+    mx = pytest.importorskip("MaterialX")
+    library = mx.createDocument()
+    mx.loadLibraries(mx.getDefaultDataLibraryFolders(), mx.getDefaultDataSearchPath(), library)
+    shaders = {
+        p.GetName(): UsdShade.Shader(p) for p in stage.Traverse() if p.GetTypeName() == "Shader"
+    }
+    nodes = {n: s for n, s in shaders.items() if s.GetIdAttr().Get().startswith("ND_")}
+    assert len(nodes) == len(unknown) == 8
+    kinds = {"color3f": "color3", "float3": "vector3", "float2": "vector2", "asset": "filename"}
+    for shader in nodes.values():
+        definition = library.getNodeDef(shader.GetIdAttr().Get())
+        for entry in shader.GetInputs():
+            kind = str(entry.GetTypeName())
+            known = definition.getActiveInput(entry.GetBaseName())
+            assert known.getType() == kinds.get(kind, kind), entry.GetBaseName()
+    look = UsdShade.Material(stage.GetDefaultPrim().GetChild("Material"))
+    assert look.ComputeSurfaceSource("mtlx")[0].GetPath().name == "OpenPBR"
+    assert look.ComputeSurfaceSource()[0].GetIdAttr().Get() == "UsdPreviewSurface"
+    lift = shaders["height"]
+    black, white = done.height["black"], done.height["white"]
+    assert lift.GetInput("bias").Get()[0] == pytest.approx(black)
+    assert lift.GetInput("scale").Get()[0] == pytest.approx(white - black)
+    assert done.errors["OpenPBR"]["rerender"] < 0.01
+
+
+NAMES = {
+    "godot": {"rust_albedo.png", "rust_orm.png", "rust_normal.png", "rust_height.png"},
+    "ambientcg": {
+        f"rust_64x64-PNG_{k}.png"
+        for k in ("Color", "Metalness", "Roughness", "NormalGL", "Displacement", "AmbientOcclusion")
+    },
+    "polyhaven": {
+        f"rust_{k}_64x64.png" for k in ("diff", "metal", "rough", "nor_gl", "disp", "ao")
+    },
+}
+
+
+@pytest.mark.parametrize("target", NAMES)
+def test_names_of_other_libraries(maps, tmp_path, target):
+    """Their files are read back by the program itself, as downloads of theirs are."""
+    export_maps(maps, tmp_path / "m", target, name="rust", height=True)
+    assert {p.name for p in (tmp_path / "m").glob("*.png")} == NAMES[target]
+    assert map_errors(read_material(tmp_path / "m"), maps)["average"] < 0.01
+
+
+def test_zip_holds_everything(maps, tmp_path):
+    out = tmp_path / "rust.zip"
+    done = export_maps(
+        maps, out, "unreal", name="rust", width=0.1, height=True, licence="CC0-1.0"
+    )  # fmt: skip
+    with zipfile.ZipFile(out) as archive:
+        assert archive.testzip() is None
+        facts = json.loads(archive.read("material.json"))
+        names = set(archive.namelist())
+        orm = archive.read("T_rust_ORM.png")
+    assert names == {"material.json"} | {f"T_rust_{k}.png" for k in ("BC", "ORM", "S", "N", "H")}
+    assert facts["licence"] == "CC0-1.0" and facts["sides"] == [0.1, 0.1]
+    assert facts["height"] == {k: done.height[k] for k in ("black", "white")}
+    assert png(orm[:])[..., 0].min() < 1
+    assert [p.name for p in tmp_path.iterdir()] == ["rust.zip"]
+
+
+@pytest.mark.parametrize(
+    ("format", "name"), [("png8", "BC.png"), ("png16", "BC.png"), ("jpeg", "BC.jpg")]
+)
+def test_textures_tell_colour_space_and_size(maps, tmp_path, format, name):
+    """Of 64 pixels on 0.1 m, 640 pixels a metre or 16.256 an inch; JPEG rounds these."""
+    export_maps(maps, tmp_path / "u", "unreal", name="rust", width=0.1, format=format)
+    with Image.open(tmp_path / "u" / f"T_rust_{name}") as colour:
+        assert colour.info["dpi"] == pytest.approx((16.256, 16.256), rel=0.02)
+        srgb = colour.info.get("srgb") if format != "jpeg" else colour.info.get("icc_profile")
+        assert srgb is not None
+    with Image.open(tmp_path / "u" / f"T_rust_{name.replace('BC', 'ORM')}") as data:
+        assert "srgb" not in data.info and "icc_profile" not in data.info
+        assert format == "jpeg" or data.info["gamma"] == 1
+
+
+def test_exr_textures_tell_colour_space_and_size(maps, tmp_path):
+    export_maps(maps, tmp_path / "u", "unreal", name="rust", width=0.1, format="exr")
+    headers = {}
+    for key in ("BC", "N"):
+        with OpenEXR.File(str(tmp_path / "u" / f"T_rust_{key}.exr")) as file:
+            headers[key] = dict(file.header())
+    assert headers["BC"]["colorInteropID"] == "lin_rec709_scene"
+    assert headers["N"]["colorInteropID"] == "data"
+    assert headers["N"]["xDensity"] == pytest.approx(16.256, rel=1e-4)
