@@ -95,44 +95,61 @@ def commands() -> Iterator[tuple[str, str]]:
 
 
 class Parsed(Exception):
-    """Raised once argparse has taken a command line."""
+    """Raised once argparse has taken a command line; its argument is the parser."""
 
 
-def parse(command: str) -> None:
-    """Let a command's own argparse read it, and nothing more. Raises SystemExit if it refuses."""
+def parse(command: str) -> set[str]:
+    """Let a command's own argparse read it, and nothing more; returns all options there are.
+
+    Raises SystemExit if argparse refuses the command.
+    """
     arguments = [PLACEHOLDERS.get(a, a) for a in shlex.split(command) if a not in ("...", "…")]
     if arguments[0] == "python":
         module, arguments = arguments[2], arguments[3:]
     else:
         module, arguments = "invrender", arguments[1:]
     if module == "benchmarks" and arguments[:1] in ([], ["NAME"]):
-        return
+        return set()
     parse_args = argparse.ArgumentParser.parse_args
 
     def only_parse(self, args=None, namespace=None):
         parse_args(self, args, namespace)
-        raise Parsed
+        raise Parsed(self)
 
     with (
         warnings.catch_warnings(action="ignore"),  # runpy's, of modules that are loaded already
         mock.patch.object(argparse.ArgumentParser, "parse_args", only_parse),
         mock.patch.object(sys, "argv", [module, *arguments]),
-        pytest.raises(Parsed),
+        pytest.raises(Parsed) as parsed,
     ):
         runpy.run_module(module, run_name="__main__", alter_sys=True)
+    return options(parsed.value.args[0])
 
 
-def test_commands_exist():
-    wrong = []
+def options(parser: argparse.ArgumentParser) -> set[str]:
+    """All options of a parser and its sub-commands."""
+    found = set()
+    for action in parser._actions:
+        found.update(action.option_strings)
+        if isinstance(action, argparse._SubParsersAction):
+            found.update(*map(options, action.choices.values()))
+    return found
+
+
+def test_commands_and_options_exist():
+    wrong, known = [], {"-c", "--extra-index-url"}  # pip's
     for command, page in sorted({command: page for page, command in commands()}.items()):
         message = io.StringIO()
         try:
             with contextlib.redirect_stderr(message):
-                parse(command)
+                known |= parse(command)
         except SystemExit:
             # An inline mention may leave out what is required, but nothing may be wrong.
             if "arguments are required" not in message.getvalue():
                 wrong.append(f"{page}: {command}: {message.getvalue().splitlines()[-1]}")
+    for page in ALL:
+        named = {code.split()[0] for code in inline(page) if code.startswith("-")}
+        wrong += [f"{identity(page)}: {option}" for option in sorted(named - known)]
     assert not wrong, "\n".join(wrong)
 
 
