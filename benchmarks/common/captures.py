@@ -145,7 +145,7 @@ def true_lights(folder: Path, capture: Capture) -> Lights:
     assert capture.true_environment is not None
     room = np.asarray(capture.true_environment, np.float32)
     gain = GAIN if capture.photo.clip_level is None else 1 / float(capture.pattern.max())
-    rig, _ = read_rig(folder / "truth" / "rig.toml")
+    rig = read_rig(folder / "truth" / "rig.toml").rig
     return replace(known_lights(capture, room, gain), rig=rig)
 
 

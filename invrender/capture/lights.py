@@ -60,7 +60,7 @@ class FoundLights:
     """What `find_lights` returns.
 
     capture: with photo and pattern the right way round and the camera where it was found; ball:
-    None where no ball was needed; notices: what a person should know.
+    None where no ball was needed; notices: what a person should know, the files' warnings first.
     """
 
     capture: Capture
@@ -91,7 +91,8 @@ def find_lights(
     if environment is not None and gain is not None:
         rig, _ = find_camera(capture.photo, capture.rig)
         capture = replace(capture, rig=rig)
-        return FoundLights(capture, known_lights(capture, environment, gain), None, ())
+        lights = known_lights(capture, environment, gain)
+        return FoundLights(capture, lights, None, capture.warnings)
     # The matrices are small: more threads than one only slow each other down.
     with threadpool_limits(1, "blas"):
         capture, found, notices = find_ball_and_orientation(capture, ball)
@@ -100,7 +101,8 @@ def find_lights(
         lights = replace(lights, environment=environment)
     if gain is not None:
         lights = replace(lights, gain=_rgb(gain))
-    return FoundLights(capture, lights, found, (*notices, *light_warnings(lights)))
+    notices = (*capture.warnings, *notices, *light_warnings(lights))
+    return FoundLights(capture, lights, found, notices)
 
 
 def known_lights(capture: Capture, environment: Array, gain: Any) -> Lights:

@@ -61,7 +61,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
         photo = read_photo(args.capture)
         check_photo(photo, str(args.capture))
         rig = Rig() if photo.fov is None else Rig(fov=photo.fov)
-        capture = Capture(photo, rig, default_pattern())
+        fov_from = "unknown" if photo.fov is None else "exif"
+        capture = Capture(photo, rig, default_pattern(), fov_from=fov_from, warnings=photo.warnings)
     nominal = capture.rig
     found = find_lights(capture, ball=args.ball)
     capture, ball, lights = found.capture, found.ball, found.lights

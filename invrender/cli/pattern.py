@@ -73,7 +73,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
             "--rig is for --optimise, --ppi, .html and .pdf; the default pattern is the same for "
             "all rigs"
         )
-    rig = read_rig(args.rig)[0] if args.rig else Rig()
+    rig = read_rig(args.rig).rig if args.rig else Rig()
     if suffix == ".pdf":
         if args.optimise or args.mirrored:
             raise InputError("the guide has no pattern: leave out --optimise and --mirrored")

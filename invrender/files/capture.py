@@ -12,7 +12,7 @@ from invrender.files.maps import read_maps
 from invrender.files.rig_toml import read_rig
 from invrender.maps import Maps
 from invrender.rig import Rig
-from invrender.types import Array, InputError
+from invrender.types import Array, InputError, Notice
 
 MIN_PHOTO = 64
 
@@ -21,8 +21,10 @@ MIN_PHOTO = 64
 class Capture:
     """One capture. ``pattern`` (h, w, 3) is the ideal one, relative radiance in [0, 1].
 
-    ``truth`` and ``true_environment`` come with synthetic captures only: to measure errors
-    against, never an input.
+    ``fov_from`` says where the rig's field of view is known from: "rig" (rig.toml), "exif", or
+    "unknown". ``warnings`` tell what is doubtful about the files. ``truth`` and
+    ``true_environment`` come with synthetic captures only: to measure errors against, never an
+    input.
     """
 
     photo: Photo
@@ -30,6 +32,8 @@ class Capture:
     pattern: Array
     truth: Maps | None = None
     true_environment: Array | None = None
+    fov_from: str = "rig"
+    warnings: tuple[Notice, ...] = ()
 
 
 def load_capture(folder: Path) -> Capture:
@@ -49,7 +53,7 @@ def load_capture(folder: Path) -> Capture:
         raise InputError(f"{folder} has more than one photo ({found}); leave one")
     photo = read_photo(photos[0])
     check_photo(photo, str(photos[0]))
-    rig, files = read_rig(folder / "rig.toml", fov=photo.fov)
+    rig, files, fov_from, warnings = read_rig(folder / "rig.toml", fov=photo.fov)
     pattern_path = _inside(folder, files.get("pattern") or _find_pattern(folder))
     pattern = read_image(pattern_path)
     if pattern.min() < 0 or pattern.max() > 1 + 1e-3:
@@ -62,7 +66,10 @@ def load_capture(folder: Path) -> Capture:
         truth = read_maps(maps)
         if (maps / "environment.exr").is_file():
             environment = read_image(maps / "environment.exr")
-    return Capture(photo, rig, np.clip(pattern, 0, 1), truth, environment)
+    return Capture(
+        photo, rig, np.clip(pattern, 0, 1), truth, environment, fov_from,
+        (*photo.warnings, *warnings),
+    )  # fmt: skip
 
 
 def check_photo(photo: Photo, name: str = "the photo") -> None:

@@ -1,28 +1,34 @@
-"""Image files in: linear RGB float32 inside, sRGB only here at the boundary."""
+"""Image files in: any format's pixels as upright linear Rec. 709 float32.
+
+`docs/reference-files.md` says what is done with every tag of every format.
+"""
 
 from __future__ import annotations
 
-import math
-import warnings
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import OpenEXR
-import tifffile
 from numpy.typing import NDArray
-from PIL import Image
 
-from invrender.colour import srgb_to_linear
-from invrender.types import Array, InputError
+from invrender.files.exif import lens
+from invrender.files.raster import Raster, clip_level, decode
+from invrender.types import Array, InputError, Notice
 
-MAX_PIXELS = 100_000_000
-_ORIENTATION, _EXIF_IFD = 0x0112, 0x8769
-_EXPOSURE_TIME, _F_NUMBER, _ISO, _FOCAL_35MM = 0x829A, 0x829D, 0x8827, 0xA405
-RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
-PHOTOS = (".exr", *RAW, ".tif", ".tiff", ".png", ".jpg", ".jpeg")
+RAW = (
+    ".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".sr2", ".srf", ".raf", ".orf", ".rw2",
+    ".pef", ".rwl", ".srw", ".3fr", ".fff", ".iiq", ".erf", ".mrw", ".x3f",
+)  # fmt: skip
+# Every ending that a photo may have, the best first.
+PHOTOS = (
+    ".exr", ".hdr", ".pic", *RAW, ".tif", ".tiff", ".png", ".heic", ".heif", ".hif", ".avif",
+    ".webp", ".jpg", ".jpeg",
+)  # fmt: skip
+# A photo with more pixels is averaged down by a whole number: 50-megapixel sensors stay whole.
+WHOLE_PIXELS = 52_000_000
+SQUARE = 0.01  # by which a pixel's width may differ from its height
 
 
 @dataclass(frozen=True)
@@ -31,13 +37,16 @@ class Photo:
 
     ``clip_level`` is the value at which a channel is saturated, None for HDR files. ``fov`` is the
     horizontal field of view in degrees and ``exposure`` the relative exposure t·ISO/(100·N²), in
-    seconds, both None where the file does not say.
+    seconds, both None where the file does not say. ``notes`` tell what was done to the file's
+    values to get here, ``warnings`` what is doubtful about them.
     """
 
     image: Array
     clip_level: float | None = None
     fov: float | None = None
     exposure: float | None = None
+    notes: tuple[Notice, ...] = ()
+    warnings: tuple[Notice, ...] = ()
 
     @property
     def height(self) -> int:
@@ -57,241 +66,124 @@ class Photo:
 
 
 def read_image(path: Path, *, linear: bool = False) -> Array:
-    """Read an EXR, PNG, TIFF, JPEG or camera raw as (H, W, 3) float32 linear RGB.
+    """Read an image of any known format as (H, W, 3) float32 linear Rec. 709, upright.
 
-    Integer files (8 or 16 bits) are decoded from sRGB unless ``linear`` is set (roughness,
-    normals); float files are linear. Grey becomes three equal channels, alpha is dropped, the EXIF
-    orientation is applied. Raises `InputError` for anything that is not such a file, is larger
-    than `MAX_PIXELS`, or holds NaN or infinity.
+    linear: the file's values stand for themselves (roughness, normals): no curve, no colour
+    conversion. Grey becomes three equal channels, alpha is dropped (and divided out where colours
+    hold it), what an EXR's data window leaves out is black. Raises `InputError` for anything that
+    is not such a file, takes too much memory, or holds NaN or infinity.
     """
-    return _read(Path(path), linear).image
+    path = Path(path)
+    raster = _read(path)
+    image = decode(raster, data=linear)
+    _check_finite(path, raster, image)
+    return image
 
 
 def read_photo(path: Path) -> Photo:
-    """Read a photograph as `read_image` does, with what its EXIF says about lens and exposure.
+    """Read a photograph as `read_image` does, with what its file says about lens and exposure.
 
-    The field of view comes from the 35 mm equivalent focal length, by CIPA DCG-001 a ratio of
-    diagonals: tan(fov/2) = (43.27 mm / 2f) · width/diagonal.
+    One of more than `WHOLE_PIXELS` is averaged down, light by light. Raises `InputError` as
+    `read_image` does, and for a photo with pixels that are missing, transparent or not square.
+
+    >>> from invrender.cli.main import EXAMPLE
+    >>> photo = read_photo(EXAMPLE / "photo.exr")
+    >>> photo.image.shape, photo.notes
+    ((720, 960, 3), ())
     """
-    photo = _read(Path(path), False)
-    if photo.clip_level is None:  # float files may hold negative values
-        photo = replace(photo, image=np.maximum(photo.image, 0))
-    return photo
+    path = Path(path)
+    raster = _read(path)
+    _check_photo(path, raster)
+    height, width = raster.data.shape[:2]
+    reduction = next(k for k in range(1, 1 << 16) if height * width <= WHOLE_PIXELS * k * k)
+    image = decode(raster, reduction=reduction)
+    _check_finite(path, raster, image)
+    clip = clip_level(raster)
+    if clip is None or raster.encoding.matrix is not None or raster.encoding.convert is not None:
+        np.maximum(image, 0, out=image)
+    _tell(raster, image.shape, reduction)
+    fov, exposure = lens(raster, *_stored_size(raster))
+    return Photo(image, clip, fov, exposure, tuple(raster.notes), tuple(raster.warnings))
 
 
-def _read(path: Path, linear: bool) -> Photo:
+def _stored_size(raster: Raster) -> tuple[int, int]:
+    """(width, height) of the upright image before it was averaged down."""
+    height, width = raster.data.shape[:2]
+    return (height, width) if raster.orientation >= 5 else (width, height)
+
+
+def _reader(path: Path, head: bytes) -> Callable[[Path], Raster]:
+    """The reader for a file, by its first bytes; by its ending for camera raw."""
+    from invrender.files import exr, hdr, pillow, png, raw, tiff
+
+    if path.suffix.lower() in RAW:
+        return raw.read_raw
+    if head.startswith(b"\x76\x2f\x31\x01"):
+        return exr.read_exr
+    if head.startswith(png.SIGNATURE):
+        return png.read_png
+    if head.startswith((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")):
+        return raw.read_raw if tiff.is_dng(path) else tiff.read_tiff
+    if head.startswith(hdr.SIGNATURES):
+        return hdr.read_hdr
+    if head.startswith(b"\xff\xd8\xff"):
+        return lambda path: pillow.read_pillow(path, "JPEG")
+    if head.startswith(b"RIFF") and head[8:12] == b"WEBP":
+        return lambda path: pillow.read_pillow(path, "WEBP")
+    if head[4:8] == b"ftyp":
+        kind = "AVIF" if b"avif" in head or b"avis" in head else "HEIF"
+        return lambda path: pillow.read_pillow(path, kind)
+    raise InputError(
+        f"{path} is not a readable image; known are EXR, HDR, TIFF, PNG, JPEG, HEIC, AVIF, WebP "
+        "and camera raw"
+    )
+
+
+def _read(path: Path) -> Raster:
     if not path.is_file():
         raise InputError(f"{path} does not exist")
     try:
         with open(path, "rb") as f:
-            head = f.read(32)
+            head = f.read(64)
+        return _reader(path, head)(path)
     except OSError:
         raise InputError(f"{path} cannot be read") from None
-    suffix = path.suffix.lower()
-    if suffix == ".exr":
-        photo = Photo(_read_exr(path))
-    elif suffix in RAW:
-        from invrender.files.raw import read_raw
+    except MemoryError:
+        raise InputError(f"{path} takes more memory than there is: scale it down") from None
 
-        image, tags = read_raw(path)
-        photo = Photo(image, 1.0, *_lens(tags, *image.shape[:2]))
-    else:
-        if head[:4] in (b"II*\0", b"MM\0*"):
-            data, orientation, tags = _read_tiff(path)
-        else:
-            data, orientation, tags = _read_pillow(path, head)
-        data = _upright(data, orientation)
-        clip = None
-        if data.dtype != np.float32:
-            # JPEG rings around a saturated area: its pixels lie a little below white.
-            clip = float(srgb_to_linear(np.array(250 / 255)))
-            data = _decoded(data, linear)
-        photo = Photo(data, clip, *_lens(tags, *data.shape[:2]))
-    if photo.clip_level is None and not np.all(np.isfinite(photo.image)):
+
+def _check_finite(path: Path, raster: Raster, image: Array) -> None:
+    if raster.data.dtype.kind == "f" and not np.all(np.isfinite(image)):
         raise InputError(f"{path} contains NaN or infinite pixels")
-    return photo
 
 
-def _decoded(data: NDArray[Any], linear: bool) -> NDArray[np.float32]:
-    """Integers (H, W, 3) of 8 or 16 bits as linear values in [0, 1], row by row."""
-    levels = 256 if data.dtype == np.uint8 else 65536
-    table = (np.arange(levels) / (levels - 1)).astype(np.float32)
-    table = table if linear else srgb_to_linear(table)
-    image = np.empty(data.shape, np.float32)
-    for row, values in zip(image, data, strict=True):
-        np.take(table, values, out=row, mode="clip")  # the mode saves a copy
-    return image
-
-
-def check_size(path: Path, width: int, height: int) -> None:
-    """Raise `InputError` for an image without pixels or with too many to be one."""
-    if width < 1 or height < 1:
-        raise InputError(f"{path} has no pixels")
-    if width * height > MAX_PIXELS:
+def _check_photo(path: Path, raster: Raster) -> None:
+    """Refuse what cannot be a photograph of a whole scene."""
+    if raster.partial:
         raise InputError(
-            f"{path} has {width} × {height} pixels, more than the {MAX_PIXELS:,} this program reads"
+            f"{path} has a data window that does not fill its picture; save the whole photo"
         )
-
-
-def _read_exr(path: Path) -> Array:
-    try:
-        with OpenEXR.File(str(path), header_only=True) as f:
-            window = f.header()["dataWindow"]
-            check_size(path, *(int(window[1][i]) - int(window[0][i]) + 1 for i in (0, 1)))
-        with OpenEXR.File(str(path), separate_channels=True) as f:
-            channels = {k: v.pixels for k, v in f.channels().items()}
-    except InputError:
-        raise
-    except Exception:  # the binding raises bare RuntimeError, TypeError and KeyError
-        raise InputError(f"{path} is not a readable OpenEXR file") from None
-    colour = {k.rpartition(".")[2]: v for k, v in reversed(channels.items())} | channels
-    if all(c in colour for c in "RGB"):
-        planes = [colour[c] for c in "RGB"]
-    elif "Y" in colour or len(channels) == 1:
-        planes = [colour.get("Y", next(iter(channels.values())))] * 3
-    else:
-        names = ", ".join(channels) or "none"
-        raise InputError(f"{path} has neither R, G, B nor Y channels (it has {names})")
-    if any(p.shape != planes[0].shape for p in planes):
-        raise InputError(f"{path} has subsampled channels; save it as plain RGB")
-    return np.stack(planes, -1).astype(np.float32)
-
-
-def _rgb(data: NDArray[Any]) -> NDArray[Any]:
-    """(H, W) or (H, W, 1..4) to (H, W, 3): grey repeated, alpha dropped."""
-    data = data[..., None] if data.ndim == 2 else data
-    return data[..., :3] if data.shape[-1] >= 3 else np.repeat(data[..., :1], 3, -1)
-
-
-def _read_pillow(path: Path, head: bytes) -> tuple[NDArray[Any], int, dict[int, Any]]:
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(path) as im:
-                check_size(path, im.width, im.height)
-                if head[:8] == b"\x89PNG\r\n\x1a\n" and head[24] == 16:
-                    # Only what lies before the pixels: Pillow decodes them all to look behind.
-                    exif = im.getexif() if "exif" in im.info else Image.Exif()
-                    data = _read_png16(path)
-                else:
-                    exif = im.getexif()
-                    im.load()
-                    wide = im.mode.startswith("I")
-                    data = np.asarray(im if wide else im.convert("RGB"))
-                    data = _rgb(data.astype(np.uint16) if wide else data)
-            return data, _orientation(exif.get(_ORIENTATION)), _exif_tags(exif)
-    except InputError:
-        raise
-    except Image.DecompressionBombError:
+    if abs(raster.aspect - 1) > SQUARE:
         raise InputError(
-            f"{path} has more than the {MAX_PIXELS:,} pixels this program reads"
-        ) from None
-    except Exception:  # Pillow's decoders raise many kinds
-        raise InputError(
-            f"{path} is not a readable image (EXR, TIFF, PNG or JPEG, complete)"
-        ) from None
+            f"{path} has pixels {raster.aspect:.3g} times as wide as high; save it with square ones"
+        )
+    if raster.alpha is not None:
+        if not np.all(raster.alpha > 0):
+            raise InputError(f"{path} has transparent pixels; save the photo without transparency")
+        done = "divided out" if raster.premultiplied else "dropped"
+        raster.note("photo-alpha", f"the photo's transparency was {done}")
 
 
-def _exif_tags(exif: Image.Exif) -> dict[int, Any]:
-    try:
-        return dict(exif.get_ifd(_EXIF_IFD))
-    except Exception:  # damaged EXIF must not cost the photo
-        return {}
-
-
-def _orientation(value: Any) -> int:
-    return int(value) if isinstance(value, (int, np.integer)) else 1
-
-
-def tiff_exif(page: tifffile.TiffPage) -> dict[int, Any]:
-    """The EXIF tags of a TIFF's page by number; none where they are damaged."""
-    try:
-        value = page.tags[_EXIF_IFD].value
-    except Exception:
-        return {}
-    found: dict[int, Any] = {}
-    for name, number in value.items() if isinstance(value, dict) else ():
-        if isinstance(number, tuple) and len(number) == 2 and number[1]:  # a fraction
-            number = number[0] / number[1]
-        if name in tifffile.TIFF.EXIF_TAGS:
-            found[int(tifffile.TIFF.EXIF_TAGS[name])] = number
-    return found
-
-
-def _read_tiff(path: Path) -> tuple[NDArray[Any], int, dict[int, Any]]:
-    try:
-        with tifffile.TiffFile(path) as f:
-            page = f.pages[0]
-            assert isinstance(page, tifffile.TiffPage)
-            check_size(path, page.imagewidth, page.imagelength)
-            tag = page.tags.get(_ORIENTATION)
-            orientation = _orientation(tag.value if tag else 1)
-            tags = tiff_exif(page)
-            if page.photometric == tifffile.PHOTOMETRIC.PALETTE or page.compression not in (
-                1, 5, 8, 32773, 32946
-            ):  # fmt: skip
-                with Image.open(path) as im:
-                    return np.asarray(im.convert("RGB")), orientation, tags
-            data = page.asarray()
-            if page.planarconfig == 2 and data.ndim == 3:
-                data = np.moveaxis(data, 0, -1)
-            if page.photometric == tifffile.PHOTOMETRIC.MINISWHITE:
-                data = data.max() - data if data.dtype == bool else np.invert(data)
-    except InputError:
-        raise
-    except Exception:  # damaged files raise many kinds
-        raise InputError(f"{path} is not a readable TIFF image") from None
-    if data.dtype == bool:
-        data = data.astype(np.uint8) * 255
-    if data.dtype in (np.float16, np.float64):
-        data = data.astype(np.float32)
-    if data.dtype not in (np.uint8, np.uint16, np.float32) or data.ndim not in (2, 3):
-        raise InputError(f"{path} is a TIFF of {data.dtype}; save it as 8 or 16 bits or as float")
-    return _rgb(data), orientation, tags
-
-
-def _read_png16(path: Path) -> NDArray[Any]:
-    """A 16-bit PNG by Mitsuba's reader: Pillow reduces the colour ones to 8 bits."""
-    from invrender.render.backend import BACKEND
-
-    import mitsuba as mi  # isort: skip
-
-    if mi.variant() is None:
-        mi.set_variant(f"{BACKEND}_ad_rgb")
-        mi.set_log_level(mi.LogLevel.Error)
-    return _rgb(np.array(mi.Bitmap(str(path))))
-
-
-def _upright(data: NDArray[Any], orientation: int) -> NDArray[Any]:
-    """Apply the EXIF orientation 1 to 8; unknown values leave the image alone."""
-    if orientation in (5, 6, 7, 8):
-        data = data.swapaxes(0, 1)
-    if orientation in (2, 3, 6, 7):
-        data = data[:, ::-1]
-    if orientation in (3, 4, 7, 8):
-        data = data[::-1]
-    return data
-
-
-def _lens(tags: dict[int, Any], height: int, width: int) -> tuple[float | None, float | None]:
-    """Field of view in degrees and relative exposure in seconds, None where EXIF is silent."""
-
-    def positive(tag: int) -> float | None:
-        value = tags.get(tag)
-        value = value[0] if isinstance(value, tuple) and value else value
-        try:
-            number = float(value)  # type: ignore[arg-type]
-        except (TypeError, ValueError, ZeroDivisionError):
-            return None
-        return number if math.isfinite(number) and number > 0 else None
-
-    focal, time = positive(_FOCAL_35MM), positive(_EXPOSURE_TIME)
-    f_number, iso = positive(_F_NUMBER), positive(_ISO)
-    fov = exposure = None
-    if focal:
-        tangent = math.hypot(36, 24) / 2 / focal * width / math.hypot(width, height)
-        fov = math.degrees(2 * math.atan(tangent))
-        fov = fov if 1 <= fov <= 170 else None
-    if time and f_number and iso:
-        exposure = time * iso / 100 / f_number**2
-    return fov, exposure
+def _tell(raster: Raster, shape: tuple[int, ...], reduction: int) -> None:
+    """Note colour conversion, orientation and scale."""
+    e = raster.encoding
+    if e.name not in ("sRGB", "linear Rec. 709"):
+        raster.note("photo-colour", f"the photo's colours were converted from {e.name}")
+    if raster.orientation != 1:
+        raster.note("photo-orientation", "the photo was turned as its orientation tag says")
+    if reduction > 1:
+        raster.note(
+            "photo-reduced",
+            f"the photo was averaged down {reduction} times, to {shape[1]} × {shape[0]} pixels; "
+            "pixel coordinates count these",
+        )

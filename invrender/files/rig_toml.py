@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+from invrender.files.write import atomic_path
 from invrender.rig import Rig, Vec3
-from invrender.types import InputError
+from invrender.types import InputError, Notice
 
 # Section and key of rig.toml for each field of Rig.
 _KEYS: dict[tuple[str, str], str] = {
@@ -25,22 +27,31 @@ _KEYS: dict[tuple[str, str], str] = {
 }
 _FILES = {("pattern", "image"), ("sample", "maps")}
 _REQUIRED = [("screen", "size"), ("screen", "height"), ("camera", "offset"), ("ball", "radius")]
+# Metres; the largest displays that are sold are 2.6 m wide.
+LARGEST_SCREEN = 3.0
 _VECTORS = {f.name for f in fields(Rig) if f.type == "Vec3"}
 
 
-def read_rig(path: Path, *, fov: float | None = None) -> tuple[Rig, dict[str, str]]:
-    """Read ``rig.toml``. ``fov`` (from EXIF, say) is taken where the file gives none.
+class RigFile(NamedTuple):
+    """What ``rig.toml`` says.
 
-    Returns the rig and the file names it gives: ``{"pattern": ..., "sample": ...}``, where present.
+    files: the names of the pattern and of the sample's true maps, where given. fov_from: where the
+    field of view is known from, "rig" (this file), "exif" or "unknown" (`Rig`'s default stands in).
+    warnings: what is doubtful about the numbers.
+    """
+
+    rig: Rig
+    files: dict[str, str]
+    fov_from: str = "rig"
+    warnings: tuple[Notice, ...] = ()
+
+
+def read_rig(path: Path, *, fov: float | None = None) -> RigFile:
+    """Read ``rig.toml``. ``fov`` (from EXIF) is taken where the file gives none.
+
     Raises `InputError` for a missing file, bad TOML, unknown or missing keys, wrong types or sizes.
     """
-    try:
-        with open(path, "rb") as f:
-            table = tomllib.load(f)
-    except OSError:
-        raise InputError(f"{path} is missing or unreadable; a capture folder needs it") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as e:
-        raise InputError(f"{path} is not valid TOML: {e}") from None
+    table = _table(path)
 
     values: dict[str, Any] = {}
     files: dict[str, str] = {}
@@ -62,9 +73,45 @@ def read_rig(path: Path, *, fov: float | None = None) -> tuple[Rig, dict[str, st
     for section, key in _REQUIRED:
         if _KEYS[section, key] not in values:
             raise InputError(f"{path}: [{section}] {key} is missing")
-    if fov is not None:
-        values.setdefault("fov", fov)
-    return Rig(**values), files
+    fov_from = "rig" if "fov" in values else "unknown" if fov is None else "exif"
+    if fov_from == "exif":
+        values["fov"] = fov
+    rig = Rig(**values)
+    warnings: tuple[Notice, ...] = ()
+    if rig.screen_size > LARGEST_SCREEN:
+        warnings = (
+            Notice(
+                "rig-units",
+                f"rig.toml makes the screen {rig.screen_size:g} m wide; its lengths are metres: if "
+                "these are millimetres, divide them by 1000",
+            ),
+        )
+    return RigFile(rig, files, fov_from, warnings)
+
+
+def _table(path: Path) -> dict[str, Any]:
+    """The file's tables; a byte order mark and UTF-16, as Windows writes them, are fine."""
+    try:
+        blob = Path(path).read_bytes()
+    except OSError:
+        raise InputError(f"{path} is missing or unreadable; a capture folder needs it") from None
+    wide = blob.startswith((b"\xff\xfe", b"\xfe\xff"))
+    try:
+        text = blob.decode("utf-16" if wide else "utf-8-sig").replace("\r\n", "\n")
+    except UnicodeDecodeError:
+        raise InputError(f"{path} is not text in UTF-8; save it as that") from None
+    text = text.replace("\r", "\n")
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as e:
+        for number, line in enumerate(text.split("\n"), 1):
+            comma = re.match(r"[^#\"'\[]*=\s*[^#\"'\[]*?(-?\d+),(\d+)\s*(#.*)?$", line)
+            if comma:
+                raise InputError(
+                    f"{path}, line {number}: write {comma[1]}.{comma[2]} with a point, not "
+                    f"{comma[1]},{comma[2]}"
+                ) from None
+        raise InputError(f"{path} is not valid TOML: {e}") from None
 
 
 def _number(path: Path, what: str, value: Any, vector: bool) -> float | Vec3:
@@ -78,7 +125,8 @@ def _number(path: Path, what: str, value: Any, vector: bool) -> float | Vec3:
             return (float(value[0]), float(value[1]), float(value[2]))
         raise InputError(f"{path}: {what} must be a number or a list of three")
     if not real(value):
-        raise InputError(f"{path}: {what} must be a number")
+        quoted = " without quotes, with a point" if isinstance(value, str) else ""
+        raise InputError(f"{path}: {what} must be a number{quoted}")
     return float(value)
 
 
@@ -100,4 +148,5 @@ def write_rig(path: Path, rig: Rig, pattern: str = "", sample: str = "") -> None
             lines.append(f"[{section}]")
             section_now = section
         lines.append(f"{key} = {text}")
-    path.write_text("\n".join(lines) + "\n")
+    with atomic_path(path) as temporary:
+        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")

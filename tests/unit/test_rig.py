@@ -88,16 +88,16 @@ def test_scale_does_not_matter():
 def test_file_round_trip(tmp_path):
     rig = Rig(0.2, 0.16, 0.01, 0.01, 60.0, (0.8, 0.85, 0.9), camera_tilt=(1.0, 2.0, 3.0))
     write_rig(tmp_path / "rig.toml", rig, "p.png", "truth/")
-    assert read_rig(tmp_path / "rig.toml") == (rig, {"pattern": "p.png", "sample": "truth/"})
+    assert read_rig(tmp_path / "rig.toml")[:2] == (rig, {"pattern": "p.png", "sample": "truth/"})
 
 
 def test_fov_of_the_file_comes_before_that_of_the_exif(tmp_path):
     path = tmp_path / "rig.toml"
     path.write_text(TOML)
-    assert read_rig(path, fov=50.0)[0].fov == 50
-    assert read_rig(path)[0].fov == Rig().fov
+    assert read_rig(path, fov=50.0).rig.fov == 50
+    assert read_rig(path).rig.fov == Rig().fov
     path.write_text(TOML.replace("offset = 0.01", "offset = 0.01\nfov = 65"))
-    assert read_rig(path, fov=50.0)[0].fov == 65
+    assert read_rig(path, fov=50.0).rig.fov == 65
 
 
 @pytest.mark.parametrize(
@@ -132,3 +132,60 @@ def test_bad_rig_files(tmp_path, old, new, message):
 def test_missing_rig_file(tmp_path):
     with pytest.raises(InputError, match=r"rig\.toml is missing"):
         read_rig(tmp_path / "rig.toml")
+
+
+PLAIN = (
+    "[screen]\nsize = 0.18\nheight = 0.153\n[camera]\noffset = 0.017\nfov = 70\n"
+    "[ball]\nradius = 0.0095\n"
+)
+
+
+@pytest.mark.parametrize(
+    "blob",
+    [
+        b"\xef\xbb\xbf" + PLAIN.encode(),
+        PLAIN.replace("\n", "\r\n").encode(),
+        b"\xef\xbb\xbf" + PLAIN.replace("\n", "\r\n").encode(),
+        PLAIN.replace("\n", "\r").encode(),
+        PLAIN.encode("utf-16"),
+    ],
+)
+def test_text_of_other_systems_is_read(tmp_path, blob):
+    (tmp_path / "rig.toml").write_bytes(blob)
+    assert read_rig(tmp_path / "rig.toml").rig == Rig(fov=70)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "match"),
+    [
+        ("0.153", "0,153", "line 3: write 0.153 with a point"),
+        ("fov = 70", "fov = 73,7  # degrees", "line 6: write 73.7"),
+        ("0.18", '"0,18"', r"\[screen\] size must be a number without quotes"),
+    ],
+)
+def test_decimal_commas_get_a_hint_at_the_place(tmp_path, old, new, match):
+    (tmp_path / "rig.toml").write_text(PLAIN.replace(old, new))
+    with pytest.raises(InputError, match=match):
+        read_rig(tmp_path / "rig.toml")
+
+
+def test_other_encodings_are_named(tmp_path):
+    (tmp_path / "rig.toml").write_bytes("# größe\n".encode("latin-1") + PLAIN.encode())
+    with pytest.raises(InputError, match="UTF-8"):
+        read_rig(tmp_path / "rig.toml")
+
+
+def test_millimetres_are_told(tmp_path):
+    text = PLAIN.replace("0.18", "180").replace("0.153", "153").replace("0.017", "17")
+    (tmp_path / "rig.toml").write_text(text.replace("0.0095", "9.5"))
+    (warning,) = read_rig(tmp_path / "rig.toml").warnings
+    assert warning.code == "rig-units" and "divide them by 1000" in warning.text
+
+
+def test_where_the_field_of_view_is_known_from(tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text(PLAIN)
+    assert read_rig(path, fov=50.0).fov_from == "rig"
+    path.write_text(PLAIN.replace("fov = 70\n", ""))
+    assert read_rig(path, fov=50.0).fov_from == "exif"
+    assert read_rig(path).fov_from == "unknown"

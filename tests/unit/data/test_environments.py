@@ -241,7 +241,7 @@ def test_negative_radiance_becomes_zero(tmp_path, caplog):
         ("a.exr", lambda p: write_exr(p, np.ones((8, 8, 3))), "twice as wide"),
         ("a.exr", lambda p: write_exr(p, np.zeros((8, 16, 3))), "black above"),
         ("a.exr", lambda p: p.write_bytes(b"junk"), "not a readable"),
-        ("a.hdr", lambda p: p.write_bytes(b"junk"), "not a readable Radiance"),
+        ("a.hdr", lambda p: p.write_bytes(b"junk"), "not a readable image"),
         ("a.hdr", lambda p: p.write_bytes(b"#?RADIANCE\n\n-Y 8 +X 16\n\2\2\0\x10"), "Radiance"),
         ("a.hdr", lambda p: p.write_bytes(b"#?RADIANCE\n\n-Y 99999 +X 99999\n"), "pixels"),
         ("a.hdr", lambda p: None, "does not exist"),
