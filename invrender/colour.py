@@ -82,8 +82,9 @@ def to_rec709(chromaticities: Sequence[float]) -> NDArray[np.float64]:
     >>> np.round(to_rec709(PRIMARIES["p3d65"]) @ [1, 0, 0], 4)
     array([ 1.2249, -0.0421, -0.0196])
     """
+    there = to_xyz(chromaticities)
     adapted = adaptation(white_xyz(*chromaticities[6:8]), white_xyz(*_D65))
-    matrix = np.linalg.inv(to_xyz(PRIMARIES["rec709"])) @ adapted @ to_xyz(chromaticities)
+    matrix = xyz_to_rec709() @ adapted @ there
     if not np.all(np.abs(matrix) < 100):
         raise ValueError(f"primaries and white {chromaticities} span no colours")
     return np.asarray(matrix)

@@ -37,7 +37,7 @@ def scene(height: int = 48, width: int = 64) -> np.ndarray:
     """Smooth linear Rec. 709 colours (H, W, 3) in (0, 1), inside every gamut."""
     y, x = np.mgrid[:height, :width]
     u, v = x / width, y / height
-    return np.stack([0.2 + 0.5 * u, 0.25 + 0.45 * v, 0.6 - 0.3 * u * v], -1).astype(np.float32)
+    return np.stack([0.15 + 0.6 * u, 0.12 + 0.3 * v, 0.3 - 0.15 * u * v], -1).astype(np.float32)
 
 
 def in_space(linear: np.ndarray, to_xyz: np.ndarray) -> np.ndarray:

@@ -167,7 +167,7 @@ def _encoding(path: Path, page: tifffile.TiffPage, raster: Raster, name: str) ->
     curve = extended_srgb if floats else SRGB.curve
     plain = LINEAR if floats else exif_encoding(raster)
     transfer = _value(page, _TRANSFER)
-    if isinstance(transfer, tuple) and len(transfer) in (raster.white + 1, 3 * raster.white + 3):
+    if np.size(transfer) in (raster.white + 1, 3 * raster.white + 3):
         steps = np.asarray(transfer, np.float64).reshape(-1, raster.white + 1) / 65535
         steps = steps.repeat(3 // len(steps), 0)
         ramp = np.linspace(0, 1, raster.white + 1)
