@@ -27,6 +27,7 @@ import tifffile
 from PIL import Image
 
 from invrender.files.images import read_photo
+from invrender.files.write import write_exr
 from invrender.types import InputError
 
 SECONDS, MEMORY = 10.0, 4 * 2**30
@@ -48,7 +49,7 @@ def seeds(folder: Path) -> dict[str, bytes]:
     def keep(name: str) -> None:
         found[name] = path.read_bytes()
 
-    made.write_exr(path, made.planes(image))
+    write_exr(path, image, width=0.1)
     keep("plain.exr")
     made.write_exr(path, made.planes(image, "beauty.") | made.planes(image, "albedo."),
                    chromaticities=made.P3_XY, pixelAspectRatio=1.0)  # fmt: skip

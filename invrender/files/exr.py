@@ -32,31 +32,35 @@ def read_exr(path: Path) -> Raster:
     (Y, RY, BY) the colours. Raises `InputError` for other layers, deep pixels, damaged files.
     """
     try:
-        with OpenEXR.File(str(path), header_only=True) as f:
-            headers = [dict(part.header) for part in f.parts]
-        if not headers:
-            raise ValueError
-        index, layer, names = _choose(path, headers)
-        header = headers[index]
-        low, high = (np.asarray(v, np.int64) for v in header["dataWindow"])
-        shown_low, shown_high = (np.asarray(v, np.int64) for v in header["displayWindow"])
-        # Every channel of every part is decoded, and the picture is pasted into its window.
-        stored = sum(
-            int(np.prod(np.asarray(h["dataWindow"][1], np.int64) - h["dataWindow"][0] + 1))
-            * len(h["channels"])
-            for h in headers
-        )
-        size = shown_high - shown_low + 1
-        check_size(path, int(size[0]), int(size[1]), 12)
-        check_size(path, int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1, 12)
-        check_size(path, 1, max(stored, 1), 4)
-        with OpenEXR.File(str(path), separate_channels=True) as f:
-            found = f.parts[index].channels
-            planes = {n: found[layer + n].pixels for n in names}
+        return _read(path)
     except InputError:
         raise
     except Exception:  # the binding raises bare RuntimeError, TypeError and KeyError
         raise InputError(f"{path} is not a readable OpenEXR file") from None
+
+
+def _read(path: Path) -> Raster:
+    with OpenEXR.File(str(path), header_only=True) as f:
+        headers = [dict(part.header) for part in f.parts]
+    if not headers:
+        raise ValueError
+    index, layer, names = _choose(path, headers)
+    header = headers[index]
+    low, high = (np.asarray(v, np.int64) for v in header["dataWindow"])
+    shown_low, shown_high = (np.asarray(v, np.int64) for v in header["displayWindow"])
+    # Every channel of every part is decoded, and the picture is pasted into its window.
+    stored = sum(
+        int(np.prod(np.asarray(h["dataWindow"][1], np.int64) - h["dataWindow"][0] + 1))
+        * len(h["channels"])
+        for h in headers
+    )
+    size = shown_high - shown_low + 1
+    check_size(path, int(size[0]), int(size[1]), 12)
+    check_size(path, int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1, 12)
+    check_size(path, 1, max(stored, 1), 4)
+    with OpenEXR.File(str(path), separate_channels=True) as f:
+        found = f.parts[index].channels
+        planes = {n: found[layer + n].pixels for n in names}
     raster = Raster(np.empty((0, 0, 3), np.float32), _encoding(path, header, layer))
     shape = (int(high[1] - low[1]) + 1, int(high[0] - low[0]) + 1)
     colours = _colours(path, raster, header, planes, shape)

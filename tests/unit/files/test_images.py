@@ -240,6 +240,13 @@ def test_damaged_files_never_crash(tmp_path, data):
         assert np.isfinite(image).all()
 
 
+def test_a_damaged_name_in_an_exr_is_refused(tmp_path):
+    write_exr(tmp_path / "a.exr", RAMP / 255.0)
+    blob = (tmp_path / "a.exr").read_bytes()
+    (tmp_path / "a.exr").write_bytes(blob.replace(b"lin_rec709_scene", b"lin_rec\xff09_scene"))
+    refused(tmp_path / "a.exr", "not a readable")
+
+
 def test_failed_write_leaves_the_old_file(tmp_path):
     write_png(tmp_path / "a.png", np.zeros((4, 4, 3)))
     before = (tmp_path / "a.png").read_bytes()
