@@ -35,6 +35,8 @@ from invrender.data.materials import (
 )
 from invrender.files.write import write_png
 from invrender.maps import Maps, resize_maps
+from invrender.render.point_lights import relight
+from invrender.rig import Rig
 from invrender.sphere import irradiance, solid_angles
 from invrender.types import InputError
 
@@ -42,6 +44,8 @@ Array = NDArray[np.floating[Any]]
 Statistics = dict[str, Array]
 QUANTILES = (5, 25, 50, 75, 95)
 SOURCES = ("procedural", "real")
+LIGHTS = np.array([[0.5 * k - 1.6, 1.2 - 0.2 * k, 1.6] for k in range(5)])  # in half samples
+POWER = 0.06  # of each, chosen by eye
 
 
 # --- statistics -----------------------------------------------------------------------------------
@@ -149,32 +153,10 @@ def compared(lines: list[dict[str, Any]]) -> Table:
 
 
 def preview(maps: Maps) -> Array:
-    """Shaded from above under a row of five point lights and a little fill, (H, W, 3) linear."""
-    h, w = maps.shape
-    x, y = np.meshgrid((np.arange(w) + 0.5) / w * 2 - 1, 1 - (np.arange(h) + 0.5) / h * 2)
-    out = 0.15 * (maps.diffuse + maps.specular * 0.7)
-    n = maps.normal
-    alpha2 = np.maximum(maps.roughness, 0.12)[..., None] ** 4
-    view = np.stack([-0.3 * x, -0.3 * y, np.ones_like(x)], -1)
-    view /= np.linalg.norm(view, axis=-1, keepdims=True)
-    for k in range(5):
-        light = np.stack([-1.6 + 0.5 * k - x, 1.2 - 0.2 * k - y, np.full_like(x, 1.6)], -1)
-        light /= np.linalg.norm(light, axis=-1, keepdims=True)
-        half = light + view
-        half /= np.linalg.norm(half, axis=-1, keepdims=True)
-        nl = np.maximum((n * light).sum(-1, keepdims=True), 0)
-        nh = np.maximum((n * half).sum(-1, keepdims=True), 0)
-        nv = np.maximum((n * view).sum(-1, keepdims=True), 0.05)
-        vh = (view * half).sum(-1, keepdims=True)
-        d = alpha2 / (np.pi * (nh * nh * (alpha2 - 1) + 1) ** 2)
-        fresnel = maps.specular + (1 - maps.specular) * (1 - vh) ** 5
-        v = 0.5 / (
-            nl * np.sqrt(nv**2 * (1 - alpha2) + alpha2)
-            + nv * np.sqrt(nl**2 * (1 - alpha2) + alpha2)
-            + 1e-6
-        )
-        out = out + (maps.diffuse / np.pi + d * v * fresnel) * nl * 0.7
-    return out
+    """Under a row of five point lights from the front left and a little fill, (H, W, 3) linear."""
+    lights = Rig().sample_size / 2 * LIGHTS
+    fill = 0.15 * (maps.diffuse + 0.7 * maps.specular)
+    return np.asarray(relight(maps, Rig(), lights).sum(0) * POWER + fill)
 
 
 def cell(maps: Maps, size: int = 128) -> Array:

@@ -150,15 +150,8 @@ def autograd(problem: Problem) -> Gradient:
 
     def run(z: Array, seed: int) -> tuple[float, Array]:
         theta = torch.from_numpy(problem.theta(z).reshape(-1, 9)).requires_grad_()
-        scene.k_d, scene.k_s, rho = theta[:, :3], theta[:, 3:6], theta[:, 6:7]
-        scene.alpha = rho**2
-        slopes = torch.cat([theta[:, 7:], torch.ones_like(rho)], -1)
-        n = scene.n = torch.nn.functional.normalize(slopes, dim=-1)
-        a = -1 / (1 + n[:, 2:])
-        b = n[:, :1] * n[:, 1:2] * a
-        scene.s = torch.cat([1 + n[:, :1] ** 2 * a, b, -n[:, :1]], -1)
-        scene.t = torch.cat([b, 1 + n[:, 1:2] ** 2 * a, -n[:, 1:2]], -1)
-        scene.local_v = scene.local(scene.v)
+        normal = torch.cat([theta[:, 7:], torch.ones_like(theta[:, :1])], -1)
+        scene.set_material(theta[:, :3], theta[:, 3:6], theta[:, 6:7], normal)
         with torch.no_grad():  # the adjoint, from samples of its own
             generator = torch.Generator().manual_seed(2 * seed)
             residual = photo - scene.radiance(SPP, generator)

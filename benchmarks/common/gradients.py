@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import statistics
-import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from benchmarks.common.scenes import MAPS, RIG, Array, Case, averaged, curve
+from benchmarks.common.timing import paired
 from invrender.render import Material
 from invrender.render import path_traced as photograph
 from invrender.render.backend import Float, dr, vector
@@ -139,16 +138,6 @@ def forward_backward(case: Case, samples: int, repeats: int) -> dict[str, float]
             dr.eval([dr.grad(v) for v in leaves])
             dr.sync_thread()
 
-        # Interleaved, so that other work on the machine slows both alike.
-        forward()
-        both()
-        pairs = []
-        for _ in range(repeats):
-            start = time.perf_counter()
-            forward()
-            middle = time.perf_counter()
-            both()
-            pairs.append((middle - start, time.perf_counter() - middle))
-        out[estimator] = statistics.median(b / a for a, b in pairs)
-        out[estimator + " forward"] = statistics.median(a for a, _ in pairs)
+        _, seconds, ratio = paired(both, forward, repeats)
+        out |= {estimator: ratio, f"{estimator} forward": seconds}
     return out

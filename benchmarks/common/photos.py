@@ -29,6 +29,7 @@ from invrender.maps import Maps, resize_maps
 from invrender.pattern.default import default_pattern
 from invrender.render import Fast, make_scene
 from invrender.rig import Rig
+from invrender.sampling import resize
 from invrender.sphere import resample_environment, rotate_environment, scale_environment
 
 Array = NDArray[np.floating[Any]]
@@ -161,15 +162,9 @@ def table_irradiance(rig: Rig, environment: Array, screen: Array, cells: int = 4
     x = ((np.arange(cells) + 0.5) / cells - 0.5) * 0.8
     p = np.stack(np.broadcast_arrays(x[None, :], -x[:, None], 0.0), -1)
     k = 12
-    light = np.einsum("ijkl,klc->ijc", rig.screen_cosines(p, k), resize_mean(screen, k))
+    light = np.einsum("ijkl,klc->ijc", rig.screen_cosines(p, k), resize(screen, k, k))
     room = resample_environment(environment, 64)
     return np.asarray(light + room_irradiance(rig, p.reshape(-1, 3), room).reshape(light.shape))
-
-
-def resize_mean(image: Array, k: int) -> Array:
-    """A square image averaged down to k × k."""
-    n = len(image) // k * k
-    return np.asarray(image[:n, :n].reshape(k, n // k, k, n // k, 3).mean((1, 3)))
 
 
 # --- the photograph -----------------------------------------------------------------------------

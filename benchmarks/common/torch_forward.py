@@ -48,9 +48,17 @@ class TorchScene:
         weight = top * theta.sin()[:, None] * (theta < math.pi / 2)[:, None]
         self.p = (weight / weight.sum()).ravel()
         self.cdf = torch.cumsum(self.p.double(), 0)
-        self.k_d, self.k_s = (t(a).reshape(-1, 3) for a in (maps.diffuse, maps.specular))
-        self.alpha = t(maps.roughness).reshape(-1, 1) ** 2
-        self.n = _unit(t(maps.normal).reshape(-1, 3))
+        self.set_material(
+            t(maps.diffuse).reshape(-1, 3), t(maps.specular).reshape(-1, 3),
+            t(maps.roughness).reshape(-1, 1), t(maps.normal).reshape(-1, 3),
+        )  # fmt: skip
+
+    def set_material(
+        self, diffuse: Tensor, specular: Tensor, roughness: Tensor, normal: Tensor
+    ) -> None:
+        """Other maps, (H·W, channels), normals of any length; differentiable."""
+        self.k_d, self.k_s, self.alpha = diffuse, specular, roughness**2
+        self.n = _unit(normal)
         a = -1 / (1 + self.n[:, 2:])
         nx, ny = self.n[:, :1], self.n[:, 1:2]
         b = nx * ny * a
