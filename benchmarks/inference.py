@@ -1,8 +1,8 @@
-"""Error of the initial maps against the time they take, for the networks' presets.
+"""Error of the initial maps against the time they take, for ours, a tiny one and the paper's.
 
 Seconds of one sample of 256 × 256 pixels, lights and clues included, median of several; each
 network's error on folders of `nets.training.dataset` (docs/guide/training.md), without and with
---quick on a few small procedural captures. Presets without weights are timed alone.
+--quick on a few small procedural captures. Networks without weights are timed alone.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks.ablations import Paper
 from benchmarks.common.plot import plot_error_over_time
 from benchmarks.common.results import benchmark_parser, table, write_results
 from benchmarks.common.timing import timed
@@ -22,7 +23,7 @@ from invrender.pattern.default import default_pattern
 from invrender.rig import Rig
 from nets.model import MAPS
 from nets.predict import WEIGHTS, Reconstructor
-from nets.store import PRESETS, build, save_weights
+from nets.store import build, channels_last
 from nets.training.dataset import write_shard
 from nets.training.draw import Options
 from nets.training.train import baseline, validate
@@ -64,14 +65,12 @@ def main(args: argparse.Namespace) -> None:
         points.append((path.stem, seconds(known, repeats), errors))
         start = [path.stem, millions(known.network), points[-1][1]]
         rows += [[*start, k, *(e[m] for m in (*MAPS, "average"))] for k, e in errors.items()]
-    for name, config in PRESETS.items():
-        if config.correction or name in [path.stem for path in args.weights]:
-            continue
-        fresh, file = build(name), args.out / f"untrained_{name}.safetensors"
-        save_weights(file, fresh, {})
-        time = seconds(Reconstructor(file), repeats)
-        rows.append([name, millions(fresh), time, "untrained", *[None] * 5])
-        file.unlink()
+    untrained = Reconstructor(args.weights[0])
+    for name, network in (("tiny", build("tiny")), ("paper", channels_last(Paper()))):
+        untrained.network = network.eval()
+        rows.append(
+            [name, millions(network), seconds(untrained, repeats), "untrained", *[None] * 5]
+        )
     for k, folder in sets.items():
         guess = baseline(folder, 128)
         rows.append(["a constant guess", None, None, k, *(guess[m] for m in (*MAPS, "average"))])

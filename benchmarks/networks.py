@@ -12,25 +12,18 @@ import csv
 from pathlib import Path
 from typing import Any
 
+import torch
+
+from benchmarks.ablations import VARIANTS
 from benchmarks.common.plot import plot_error_over_time
 from benchmarks.common.results import bar, benchmark_parser, table, write_results
 from nets.model import MAPS
+from nets.store import PRESETS, channels_last
 from nets.training.dataset import write_shard
 from nets.training.draw import Options
 from nets.training.train import baseline, train
 from nets.training.train import parser as train_parser
 
-VARIANTS = {
-    "no clues (LPL+)": ("none", "off", "off", "off", "off"),
-    "mirror ball": ("mirrorball", "off", "off", "off", "off"),
-    "plane clues": ("plane", "off", "off", "off", "off"),
-    "coloured normal clues": ("colored", "off", "off", "off", "off"),
-    "the paper's clues": ("full", "off", "off", "off", "off"),
-    "+ clues of the screen": ("full", "on", "off", "off", "off"),
-    "+ slopes": ("full", "on", "on", "off", "off"),
-    "+ lobes (ours)": ("full", "on", "on", "on", "off"),
-    "ours with denoiser": ("full", "on", "on", "on", "on"),
-}  # clues, active, slopes, lobes, denoiser
 FULL, NONE = "+ lobes (ours)", "no clues (LPL+)"
 
 
@@ -45,16 +38,15 @@ def make_data(out: Path) -> None:
 def train_variant(name: str, args: argparse.Namespace) -> list[dict[str, float]]:
     """Train a variant and return its log."""
     out = args.out / "runs" / name.replace(" ", "-").strip("+-").replace("(", "").replace(")", "")
-    clues, active, slopes, lobes, denoiser = VARIANTS[name]
+    variant, loss = VARIANTS[name]
     options = train_parser().parse_args([
         "--data", str(args.data), "--out", str(out), "--valid", *args.valid,
-        "--preset", args.preset, "--clues", clues, "--active", active, "--slopes", slopes,
-        "--lobes", lobes, "--denoiser", denoiser,
         "--steps", str(args.steps), "--every", str(args.every),
         "--crop", str(args.crop), "--batch", str(args.batch), "--valid-count", "96",
         "--threads", str(args.threads), "--device", args.device,
     ])  # fmt: skip
-    train(options)
+    torch.manual_seed(options.seed)
+    train(options, channels_last(variant(PRESETS[args.preset][1])), loss)
     with open(out / "log.csv", newline="") as f:
         return [{k: float(v) for k, v in row.items()} for row in csv.DictReader(f)]
 

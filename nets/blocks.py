@@ -14,10 +14,7 @@ from torch import Tensor, nn
 
 
 class Pointwise(nn.Module):
-    """1×1 convolution as a matrix product over channels-last memory: torch's own is slower there.
-
-    ``scale`` (out,) multiplies the outputs, at the cost of scaling the weights.
-    """
+    """1×1 convolution as a matrix product over channels-last memory, where torch's is slower."""
 
     def __init__(self, inputs: int, outputs: int, bias: bool = True) -> None:
         super().__init__()
@@ -25,14 +22,21 @@ class Pointwise(nn.Module):
         self.weight = nn.Parameter(torch.empty(outputs, inputs).uniform_(-bound, bound))
         self.bias = nn.Parameter(torch.empty(outputs).uniform_(-bound, bound)) if bias else None
 
-    def forward(self, x: Tensor, scale: Tensor | None = None) -> Tensor:
-        x = x.permute(0, 2, 3, 1)
-        if scale is None:
-            y = F.linear(x, self.weight, self.bias)
+    def forward(self, x: Tensor) -> Tensor:
+        return F.linear(x.permute(0, 2, 3, 1), self.weight, self.bias).permute(0, 3, 1, 2)
+
+    def add_to(self, x: Tensor, u: Tensor, scale: Tensor, gain: Tensor | None = None) -> Tensor:
+        """x + scale·(W(gain·u) + b) as one matrix product: ``scale`` (out,) of the outputs and
+        ``gain`` (B, in, 1, 1) of the inputs multiply the weights."""
+        assert self.bias is not None
+        b, c, h, w = x.shape
+        weight = (self.weight * scale[:, None]).T
+        flat, inputs = (v.permute(0, 2, 3, 1).reshape(b, h * w, -1) for v in (x, u))
+        if gain is None:
+            y = torch.addmm(flat.flatten(0, 1), inputs.flatten(0, 1), weight)
         else:
-            bias = None if self.bias is None else self.bias * scale
-            y = F.linear(x, self.weight * scale[:, None], bias)
-        return y.permute(0, 3, 1, 2)
+            y = torch.baddbmm(flat, inputs, gain.flatten(1)[:, :, None] * weight)
+        return (y.view(b, h, w, c) + scale * self.bias).permute(0, 3, 1, 2)
 
 
 class LayerNorm2d(nn.Module):
@@ -79,9 +83,10 @@ class NAFBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         u = simple_gate(self.depthwise(self.conv1(self.norm1(x))))
-        u = u * self.attention(u.mean((2, 3), keepdim=True))
-        y = x + self.conv3(u, self.beta)
-        return y + self.conv5(simple_gate(self.conv4(self.norm2(y))), self.gamma)
+        # W₃(a·u) = (W₃·a)u: attention scales the weights of each image, not its pixels.
+        attention = self.attention(u.mean((2, 3), keepdim=True))
+        y = self.conv3.add_to(x, u, self.beta, attention)
+        return self.conv5.add_to(y, simple_gate(self.conv4(self.norm2(y))), self.gamma)
 
 
 def blocks(channels: int, count: int) -> nn.Sequential:
@@ -111,15 +116,30 @@ class Encoder(nn.Module):
         return x, skips
 
 
+class Upsample(nn.Sequential):
+    """1×1 convolution to four times the channels and a pixel shuffle: twice the size, half of the
+    channels. Both in channels-last memory, where torch's shuffle is slow."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__(Pointwise(2 * channels, 4 * channels, bias=False))
+        self.channels = channels
+
+    def forward(self, x: Tensor) -> Tensor:
+        (b, _, h, w), c = x.shape, self.channels
+        # The outputs' order is (channel, row, column) as in torch's shuffle; here the channel last.
+        own: Tensor = self.get_parameter("0.weight")
+        weight = own.view(c, 4, 2 * c).transpose(0, 1).reshape(4 * c, 2 * c)
+        y = F.linear(x.permute(0, 2, 3, 1), weight).view(b, h, w, 2, 2 * c)
+        return y.transpose(2, 3).reshape(b, 2 * h, 2 * w, c).permute(0, 3, 1, 2)
+
+
 class Decoder(nn.Module):
-    """The way back: 1×1 convolution and pixel shuffle, plus the encoder's skip, then blocks."""
+    """The way back: `Upsample`, plus the encoder's skip, then blocks."""
 
     def __init__(self, outputs: int, width: int, counts: Sequence[int]) -> None:
         super().__init__()
         channels = [width << k for k in reversed(range(len(counts)))]
-        self.up = nn.ModuleList(
-            nn.Sequential(Pointwise(2 * c, 4 * c, bias=False), nn.PixelShuffle(2)) for c in channels
-        )
+        self.up = nn.ModuleList(Upsample(c) for c in channels)
         self.levels = nn.ModuleList(blocks(c, n) for c, n in zip(channels, counts, strict=True))
         self.ending = nn.Conv2d(width, outputs, 3, padding=1)
 
@@ -129,7 +149,14 @@ class Decoder(nn.Module):
         return self.ending(x)
 
 
+def channels_last_cat(parts: Sequence[Tensor]) -> Tensor:
+    """Images (B, C, H, W) side by side, written once, into channels-last memory."""
+    return torch.cat([x.permute(0, 2, 3, 1) for x in parts], -1).permute(0, 3, 1, 2)
+
+
 def pad_to(x: Tensor, multiple: int) -> Tensor:
     """Repeat the border at the right and below until H and W are multiples of ``multiple``."""
     h, w = x.shape[-2:]
+    if h % multiple == w % multiple == 0:
+        return x
     return F.pad(x, (0, -w % multiple, 0, -h % multiple), mode="replicate")

@@ -22,14 +22,17 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from nets.batch import Batch
-from nets.blocks import Decoder, Encoder, blocks, pad_to
-from nets.model import MAX_SIGMA, MIN_SIGMA, Config, encode, slope_normal
+from nets.batch import Batch, split_channels
+from nets.blocks import Decoder, Encoder, blocks, channels_last_cat, pad_to
+from nets.model import MAX_SIGMA, MIN_ROUGHNESS, MIN_SIGMA, Config, encode, slope_normal
+from nets.slopes import asinh
 
 NOISE = (0.04, 0.01)  # of the photo: relative to the pixel, and to a white plane
 ALBEDO_CORRELATION = (0.9, 0.95)  # between the colours of k_d's error, and of k_s's
 REACH = (0.1, 0.1, 0.1, 0.2)  # of a step, in the outputs' unit: k_d, k_s, ρ, slopes
 DOUBT = 3.0  # logit by which a fresh correction keeps to the network's maps and not to the lobes
+OUTPUTS = {"step": 9, "log_sigma": 4, "towards_lobes": 7}  # the decoder's, and channels of each
+LOG_SIGMA_CHANGE = (-3.0, 2.0)  # bounds of the change of an expected error, as a logarithm
 INPUTS = 3 * 4 + 9 + 4 + 9 + 6 + 9 + 1 + 2 + 7
 
 
@@ -87,19 +90,20 @@ def features(batch: Batch) -> Tensor:
         encode(photo), encode(image), encode(e), encode(b),
         2 * theta[:, :7] - 0.5, theta[:, 7:],
         torch.log(batch["sigma0"].clamp(min=MIN_SIGMA)) / 2 + 1.5,
-        torch.asinh(batch["jacobian"][:, 6:] / level.repeat(1, 3, 1, 1)),
+        asinh(batch["jacobian"][:, 6:] / level.repeat(1, 3, 1, 1)),
         theta[:, :3] * e / level, theta[:, 3:6] * b / level,
         step.clamp(-3, 3),
         torch.log1p(surprise.clamp(0, 1e4)) / 2,
         batch["position"],
         2 * batch["lobes"] - 0.5,
     ]  # fmt: skip
-    return torch.cat(parts, 1)
+    return channels_last_cat(parts)
 
 
 class Correction(nn.Module):
     """See the module's docstring. Returns what `nets.model.Network` returns, but no normal0."""
 
+    reach: Tensor
     calibration: Tensor
 
     def __init__(self, config: Config) -> None:
@@ -109,7 +113,7 @@ class Correction(nn.Module):
         self.multiple = 1 << levels
         self.encoder = Encoder(INPUTS, width, config.encoder)
         self.middle = blocks(width << levels, config.middle)
-        self.decoder = Decoder(9 + 4 + 7, width, config.decoder)
+        self.decoder = Decoder(sum(OUTPUTS.values()), width, config.decoder)
         nn.init.zeros_(self.decoder.ending.weight)  # a fresh one changes next to nothing
         nn.init.zeros_(self.decoder.ending.bias)  # type: ignore[arg-type]
         reach = torch.tensor(REACH).repeat_interleave(torch.tensor([3, 3, 1, 2]))
@@ -119,18 +123,20 @@ class Correction(nn.Module):
     def forward(self, batch: Batch) -> Batch:
         height, width = batch["photo"].shape[-2:]
         x = torch.nan_to_num(features(batch), 0.0, 0.0, 0.0)
-        x = pad_to(x, self.multiple).contiguous(memory_format=torch.channels_last)
-        y, skips = self.encoder(x)
+        y, skips = self.encoder(pad_to(x, self.multiple))
         y = self.decoder(self.middle(y), skips)[..., :height, :width]
+        out = split_channels(y, OUTPUTS)
         # Some of the way to the lobes, by the network's judgement, and a step of its own.
-        towards = torch.sigmoid(y[:, 13:] - DOUBT) * (batch["lobes"] - batch["theta"][:, :7])
-        theta = batch["theta"] + self.reach * y[:, :9]
+        share = torch.sigmoid(out["towards_lobes"] - DOUBT)
+        towards = share * (batch["lobes"] - batch["theta"][:, :7])
+        theta = batch["theta"] + self.reach * out["step"]
         theta = torch.cat([theta[:, :7] + towards, theta[:, 7:]], 1)
         diffuse, specular, roughness = theta[:, :3], theta[:, 3:6], theta[:, 6:7]
         if not self.training:
             diffuse, specular = diffuse.clamp(0, 1), specular.clamp(0, 1)
-            roughness = roughness.clamp(0.02, 1)
-        sigma = batch["sigma0"].clamp(MIN_SIGMA, MAX_SIGMA) * torch.exp(y[:, 9:13].clamp(-3, 2))
+            roughness = roughness.clamp(MIN_ROUGHNESS, 1)
+        sigma = batch["sigma0"].clamp(MIN_SIGMA, MAX_SIGMA)
+        sigma = sigma * torch.exp(out["log_sigma"].clamp(*LOG_SIGMA_CHANGE))
         sigma = (sigma * self.calibration[:, None, None]).clamp(MIN_SIGMA, MAX_SIGMA)
         return {
             "normal": slope_normal(theta[:, 7:]), "diffuse": diffuse,

@@ -1,26 +1,30 @@
-"""The two-branch network with lighting clues, and its denoiser.
+"""The two-branch network with lighting clues.
 
 Image encoder → normal decoder → initial normals → normal clues (split-sum, inside the forward
-pass) → clue encoder; both bottlenecks → fusion → material decoder. A batch is a dict of tensors:
+pass) → clue encoder; both bottlenecks → fusion → material decoder, whose material maps are means
+of its own and of what the photo says of a dielectric and of bare metal. A batch is a dict of
+tensors:
 
-    photo (B, 3, H, W) radiance; position (B, 2, H, W) in [-1, 1]², x right, y up; and the light as
+    photo (B, 3, H, W) radiance; position (B, 2, H, W) in [-1, 1]², x right, y up; the light as
     `nets.clues.light_inputs` gives it, each with a batch axis: env_clues, active_clues,
-    slope_clues, sky, screen, ball, pattern, rig; and with ``lobes`` lobes (B, 7, H, W), albedos and
-    roughness as `invrender.refine.lobes` finds them, and what the photo says of dielectric and of
-    metal, evidence (B, 16, H, W) and costs (B, 40), see `nets.batch.pack_evidence`.
+    slope_clues, sky, screen, ball, pattern, rig; lobes (B, 7, H, W), albedos and roughness as
+    `invrender.refine.lobes` finds them, and what the photo says of dielectric and of metal,
+    evidence (B, 16, H, W) and costs (B, 40), see `nets.batch.pack_evidence`.
 
-All of it may be in any unit of radiance: it is divided by that of a white plane first.
+All of it may be in any unit of radiance: it is divided by that of a white plane first. The steps
+of the forward pass are methods, which ablations replace.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from invrender.types import InputError
 from nets.batch import (
     COST_COUNT,
     EVIDENCE,
@@ -29,84 +33,92 @@ from nets.batch import (
     split_channels,
     unpack_evidence,
 )
-from nets.blocks import Decoder, Encoder, Pointwise, blocks, pad_to
+from nets.blocks import Decoder, Encoder, Pointwise, blocks, channels_last_cat, pad_to
+from nets.clues import ALBEDO, BASIS, WHITE
 from nets.slopes import SLOPE_FEATURES, slope_features
 from nets.splitsum import brdf_table, hit_screen, normal_clues, reflect, sample, view_directions
 
-ALBEDO = 0.6
-BASIS = ((0.2, 0.0), (0.2, 0.6), (0.6, 0.0), (0.6, 0.6))
-CLUES = ("none", "mirrorball", "plane", "colored", "full")
 MAPS = ("normal", "diffuse", "roughness", "specular")
 LIGHTS = ("env_clues", "active_clues", "slope_clues", "sky", "screen", "ball", "pattern")
-MIN_SIGMA, MAX_SIGMA = 0.002, 1.0
+WHITE_CLUE = slice(3 * WHITE, 3 * WHITE + 3)  # the white plane's channels of plane clues
+
 DIELECTRIC_F0 = 0.04  # of common plastics, stone and paint: an index of refraction of 1.5
-# What the material decoder puts out, and how many channels each.
-OUTPUTS = {"slope": 2, "diffuse": 3, "roughness": 1, "specular": 3, "log_sigma": 4}
-# Logits of the dielectric's and the metal's weights beside the network's own map.
-WEIGHTS = {"diffuse_weights": 2, "roughness_weights": 2, "specular_weights": 2}
+MIN_ROUGHNESS = 0.02  # of the maps that leave the network; smoother looks the same in a photo
+# Bounds of the expected errors, in the maps' unit: half of an 8-bit step, and all of a map's range.
+MIN_SIGMA, MAX_SIGMA = 0.002, 1.0
+LEAST_LOG_SIGMA = -6.2  # log of `MIN_SIGMA`
+MAX_RADIANCE = 1e4  # of lights, in units of a white plane: what float16 shards can hold
+MAX_PHOTO = 1e3  # likewise of what `encode` tells apart
+DARK = 0.02  # radiance in units of a white plane from which on `encode` is logarithmic
+MAX_RATIO = 4.0  # of photo to white plane; a highlight beyond it is as bright as any
+HIDDEN_COSTS = 64  # units between the fits' costs and the bottleneck
+
+# What the decoders put out: how many channels, and the bias of a fresh network, which predicts a
+# plane of middling materials, in doubt. The weights are logits of the dielectric's and the metal's
+# shares of a map; that of the network's own is 0.
+NORMAL_OUTPUTS = {"slope": [0.0, 0.0]}
+OUTPUTS = {
+    "slope": [0.0, 0.0],
+    "diffuse": [0.3, 0.3, 0.3],
+    "roughness": [0.5],
+    "specular": [0.1, 0.1, 0.1],
+    "log_sigma": [-3.0, -1.5, -1.5, -2.0],
+    "diffuse_weights": [-1.0, -1.0],
+    "roughness_weights": [-1.0, -1.0],
+    "specular_weights": [-1.0, -1.0],
+}
+FRESH_SCALE = 0.1  # of a fresh decoder's last weights, as torch draws them
 
 
 @dataclass(frozen=True)
 class Config:
-    """What is built. ``clues``: none (LPL+), mirrorball (the ball's image instead of clues), plane,
-    full (and normal clues in grey) or colored (those in colour).
-
-    active: clues of the screen's light too, and the ratio of the photo to a white plane.
-    slopes: how radiance depends on the slopes, and what that says of them (`nets.slopes`).
-    lobes: what all pixels of a material, fitted together, say of it (`invrender.refine.lobes`): as
-    inputs, and each of the network's material maps is a mean of its own and of what the photo says
-    of a dielectric and of bare metal, by weights that the network finds. clue_skips: the material
-    decoder also gets the clue encoder's skips. narrow_fusion: halve the channels before the fusion
-    blocks, not after. correction: not this network but the correction of its maps
-    (`nets.correction`), which heeds sizes alone.
-    """
+    """Sizes: channels at full resolution; blocks of each level of the encoders, of the fusion, and
+    of each level of the decoders."""
 
     width: int = 16
     encoder: tuple[int, ...] = (1, 1, 2, 4)
     middle: int = 4
     decoder: tuple[int, ...] = (1, 1, 1, 1)
-    clues: str = "full"
-    active: bool = True
-    slopes: bool = True
-    lobes: bool = True
-    clue_skips: bool = True
-    narrow_fusion: bool = True
-    denoiser: bool = False
-    correction: bool = False
 
-    def __post_init__(self) -> None:
-        if self.clues not in CLUES:
-            raise InputError(f"clues must be one of {', '.join(CLUES)}, got {self.clues!r}")
+
+@dataclass(frozen=True)
+class View:
+    """A normalised batch at its pixels, padded to a multiple of the network's coarsest cell: photo
+    and position, directions to the camera, plane clues of the room, those of the screen and the
+    slope clues, and the pattern as each pixel would mirror it were it flat."""
+
+    batch: Batch
+    photo: Tensor
+    position: Tensor
+    to_camera: Tensor
+    plane: Tensor
+    active: Tensor
+    slopes: Tensor
+    on_screen: Tensor
+
+    @property
+    def mirrored(self) -> Tensor:
+        return sample(self.batch["pattern"], self.on_screen * 2 - 1, "zeros")
 
 
 def encode(x: Tensor) -> Tensor:
-    """Radiance in units of a white plane to about [-1, 1], log-like from 0.02 upwards."""
-    return torch.log2(x.clamp(0, 1e3) + 0.02) * 0.25 + 0.4
-
-
-class Denoiser(nn.Module):
-    """(photo, pattern as captured, pattern as it should be) → the photo under the latter.
-
-    A plain NAFNet on encoded images that adds to its input.
-    """
-
-    def __init__(self, config: Config) -> None:
-        super().__init__()
-        self.encoder = Encoder(9, config.width, config.encoder)
-        self.middle = blocks(config.width << len(config.encoder), config.middle)
-        self.decoder = Decoder(3, config.width, config.decoder)
-
-    def forward(self, photo: Tensor, captured: Tensor, ideal: Tensor) -> Tensor:
-        """Encoded images (B, 3, H, W), H and W multiples of 2^levels."""
-        x, skips = self.encoder(torch.cat([photo, captured, ideal], 1))
-        return photo + self.decoder(self.middle(x), skips)
+    """Radiance in units of a white plane to about [-1, 1], log-like from `DARK` upwards."""
+    return torch.log2(x.clamp(0, MAX_PHOTO) + DARK) * 0.25 + 0.4
 
 
 class Network(nn.Module):
     """See the module's docstring. Returns normal0 and normal (B, 3, H, W) unit; diffuse, specular
     (B, 3, H, W), roughness (B, 1, H, W), unclamped while training; sigma (B, 4, H, W), the expected
-    error of `MAPS`, normals encoded to [0, 1]; with a denoiser also denoised, encoded.
+    error of `MAPS`, normals encoded to [0, 1].
     """
+
+    # Inputs of the encoders and how many channels each.
+    IMAGE: ClassVar = {
+        "photo": 3, "mirrored": 3, "position": 2, "ratio": 3, "active": 9,
+        "slopes": SLOPE_FEATURES, "lobes": 7, "evidence": EVIDENCE_CHANNELS,
+    }  # fmt: skip
+    CLUES: ClassVar = {"plane": 12, "grey": len(BASIS), "screen": 6}
+    OUTPUTS: ClassVar = OUTPUTS
 
     table: Tensor
     calibration: Tensor
@@ -117,138 +129,142 @@ class Network(nn.Module):
         levels, width = len(config.encoder), config.width
         self.multiple = 1 << levels
         deep = width << levels
-        image, clue = _channels(config)
-        self.denoiser = Denoiser(config) if config.denoiser else None
-        self.encoder = Encoder(image, width, config.encoder)
-        self.normal_decoder = Decoder(2, width, config.decoder)
-        self.clue_encoder = Encoder(clue, width, config.encoder) if clue else None
-        both = 2 * deep if clue else deep
-        inside = deep if config.narrow_fusion else both
-        narrow = nn.Conv2d(both, deep, 3, padding=1)
-        steps = [blocks(inside, config.middle), narrow]
-        self.fusion = nn.Sequential(*(reversed(steps) if config.narrow_fusion else steps))
-        self.skips = (
-            nn.ModuleList(Pointwise(width << k, width << k) for k in range(levels))
-            if config.clue_skips and clue
-            else None
+        self.encoder = Encoder(sum(self.IMAGE.values()), width, config.encoder)
+        self.normal_decoder = Decoder(_count(NORMAL_OUTPUTS), width, config.decoder)
+        self.clue_encoder = Encoder(sum(self.CLUES.values()), width, config.encoder)
+        self.fusion = nn.Sequential(
+            nn.Conv2d(2 * deep, deep, 3, padding=1), blocks(deep, config.middle)
         )
-        self.costs = nn.Sequential(nn.Linear(COST_COUNT, 64), nn.GELU(), nn.Linear(64, deep)) if (
-            config.lobes
-        ) else None  # fmt: skip
-        self.outputs = OUTPUTS | (WEIGHTS if config.lobes else {})
-        self.material_decoder = Decoder(sum(self.outputs.values()), width, config.decoder)
-        # A fresh network predicts a plane of middling materials, in doubt.
-        with torch.no_grad():
-            self.material_decoder.ending.weight *= 0.1
-            self.normal_decoder.ending.weight *= 0.1
-            start = [0, 0, *[0.3] * 3, 0.5, *[0.1] * 3, -3, -1.5, -1.5, -2]
-            start += [-1] * (sum(WEIGHTS.values()) if config.lobes else 0)
-            for decoder, values in ((self.normal_decoder, [0, 0]), (self.material_decoder, start)):
-                assert decoder.ending.bias is not None
-                decoder.ending.bias.copy_(torch.tensor(values))
+        self.skips = nn.ModuleList(Pointwise(width << k, width << k) for k in range(levels))
+        self.costs = nn.Sequential(
+            nn.Linear(COST_COUNT, HIDDEN_COSTS), nn.GELU(), nn.Linear(HIDDEN_COSTS, deep)
+        )
+        self.material_decoder = Decoder(_count(self.OUTPUTS), width, config.decoder)
+        _begin(self.normal_decoder, NORMAL_OUTPUTS)
+        _begin(self.material_decoder, self.OUTPUTS)
         self.register_buffer("table", brdf_table(), persistent=False)
-        self.register_buffer("calibration", torch.ones(4))
+        self.register_buffer("calibration", torch.ones(len(MAPS)))
 
     def forward(self, batch: Batch) -> Batch:
         height, width = batch["photo"].shape[-2:]
-        batch = normalise(batch, self.config)
-        position = pad_to(batch["position"], self.multiple)
-        photo = pad_to(batch["photo"], self.multiple)
-        rig, pattern = batch["rig"], batch["pattern"]
-
-        # What each pixel would show as a mirror: the pattern as captured.
-        view = view_directions(position, rig)
-        up = torch.zeros_like(view)
-        up[:, 2] = 1
-        st = hit_screen(position, reflect(view, up), rig)
-        mirrored = sample(pattern, st * 2 - 1, "zeros")
-        out: Batch = {}
-        seen = encode(photo)
-        if self.denoiser is not None:
-            ideal = sample(batch["screen"][:, :3], (st * 2 - 1) / 2)
-            seen = out["denoised"] = self.denoiser(seen, encode(mirrored), encode(ideal))
-        active = sample(batch["active_clues"], position)
-        plane = sample(batch["env_clues"], position)
-        inputs = [seen, encode(mirrored), position]
-        if self.config.active:
-            white = active[:, 9:12]
-            if _knows_environment(self.config):
-                white = white + plane[:, 9:12]
-            ratio = photo / (white / ALBEDO + 0.02)
-            inputs += [ratio.clamp(max=4), encode(torch.cat([active[:, :3], active[:, 6:]], 1))]
-        if self.config.slopes:
-            inputs.append(
-                slope_features(photo, active + plane, sample(batch["slope_clues"], position))
-            )
-        if self.config.lobes:
-            inputs.append(2 * pad_to(batch["lobes"], self.multiple) - 0.5)
-            inputs.append(_scaled(pad_to(batch["evidence"], self.multiple)))
-
-        x, skips = self.encoder(_last(torch.cat(inputs, 1)))
+        view = self.view(batch)
+        x, skips = self.encoder(channels_last_cat(self.image_inputs(view)))
         slope0 = self.normal_decoder(x, skips)
         normal0 = slope_normal(slope0)
-        if self.clue_encoder is not None:
-            clues = self._clues(batch, normal0, position, plane)
-            c, clue_skips = self.clue_encoder(_last(clues))
-            x = torch.cat([x, c], 1)
-            if self.skips is not None:
-                skips = [
-                    s + conv(k) for s, k, conv in zip(skips, clue_skips, self.skips, strict=True)
-                ]
-        x = self.fusion(x)
-        if self.costs is not None:
-            x = x + self.costs(batch["costs"])[..., None, None]
-        y = self.material_decoder(x, skips)
-        normal0 = normal0[..., :height, :width]
-        y = split_channels(y[..., :height, :width], self.outputs)
-        slope = slope0[..., :height, :width] + y["slope"]
-        diffuse, roughness, specular = y["diffuse"], y["roughness"], y["specular"]
-        if self.config.lobes:
-            evidence = unpack_evidence(batch)
-            black = torch.zeros_like(diffuse)
-            diffuse = _mean(diffuse, evidence.dielectric_diffuse, black, y["diffuse_weights"])
-            roughness = _mean(
-                roughness,
-                evidence.dielectric_roughness,
-                evidence.metal_roughness,
-                y["roughness_weights"],
-            )
-            specular = _mean(
-                specular, black + DIELECTRIC_F0, evidence.metal_material_specular,
-                y["specular_weights"],
-            )  # fmt: skip
+        x, skips = self.with_clues(x, skips, normal0, view)
+        y = self.material_decoder(x, skips)[..., :height, :width]
+        outputs = {k: len(v) for k, v in self.OUTPUTS.items()}
+        out = split_channels(y, outputs)
+        maps = self.material(out, batch)
         if not self.training:
-            diffuse, specular = diffuse.clamp(0, 1), specular.clamp(0, 1)
-            roughness = roughness.clamp(0.02, 1)
-        sigma = torch.exp(y["log_sigma"].clamp(-6.2, 0)) * self.calibration[:, None, None]
-        out |= {"normal0": normal0, "normal": slope_normal(slope), "diffuse": diffuse}
-        out |= {"roughness": roughness, "specular": specular}
-        out["sigma"] = sigma.clamp(MIN_SIGMA, MAX_SIGMA)
-        if "denoised" in out:
-            out["denoised"] = out["denoised"][..., :height, :width]
-        return out
+            maps = {k: v.clamp(_least(k), 1) for k, v in maps.items()}
+        sigma = torch.exp(out["log_sigma"].clamp(LEAST_LOG_SIGMA, 0))
+        sigma = sigma * self.calibration[:, None, None]
+        return {
+            "normal0": normal0[..., :height, :width],
+            "normal": slope_normal(slope0[..., :height, :width] + out["slope"]),
+            **maps,
+            "sigma": sigma.clamp(MIN_SIGMA, MAX_SIGMA),
+        }
 
-    def _clues(self, batch: Batch, normal: Tensor, position: Tensor, plane: Tensor) -> Tensor:
-        """Input of the clue encoder."""
-        if self.config.clues == "mirrorball":
-            return encode(sample(batch["ball"], position))
-        clues = [encode(plane)]
-        if self.config.clues in ("full", "colored"):
-            screen = batch["screen"] if self.config.active else None
-            images, seen = normal_clues(
-                normal, position, batch["rig"], batch["sky"], screen, self.table, BASIS, ALBEDO
-            )
-            if self.config.clues == "full":
-                b, _, h, w = images.shape
-                images = images.reshape(b, len(BASIS), 3, h, w).mean(2)
-            clues += [encode(images)] + ([] if seen is None else [encode(seen)])
-        return torch.cat(clues, 1)
+    def view(self, batch: Batch) -> View:
+        """What a batch shows at its pixels."""
+        batch = self.normalise(batch)
+        position, rig = pad_to(batch["position"], self.multiple), batch["rig"]
+        photo = pad_to(batch["photo"], self.multiple)
+        to_camera = view_directions(position, rig)
+        up = torch.zeros_like(to_camera)
+        up[:, 2] = 1
+        on_screen = hit_screen(position, reflect(to_camera, up), rig)
+        clues = ("env_clues", "active_clues", "slope_clues")
+        parts = sample(torch.cat([batch[k] for k in clues], 1), position)
+        plane, active, slopes = parts.split([batch[k].shape[1] for k in clues], 1)
+        return View(batch, photo, position, to_camera, plane, active, slopes, on_screen)
+
+    def normalise(self, batch: Batch) -> Batch:
+        """The batch in units of a white plane's mean radiance."""
+        return normalise(batch)
+
+    def image_inputs(self, view: View) -> list[Tensor]:
+        """Inputs of the image encoder, in the order of `IMAGE`."""
+        return [
+            *self.photo_inputs(view),
+            *self.screen_inputs(view),
+            *self.slope_inputs(view),
+            *self.lobe_inputs(view),
+        ]
+
+    def photo_inputs(self, view: View) -> list[Tensor]:
+        return [encode(view.photo), encode(view.mirrored), view.position]
+
+    def screen_inputs(self, view: View) -> list[Tensor]:
+        """The photo over what a white plane shows, and what others show under the screen alone."""
+        white = view.active[:, WHITE_CLUE] + view.plane[:, WHITE_CLUE]
+        ratio = view.photo / (white / ALBEDO + DARK)
+        return [
+            ratio.clamp(max=MAX_RATIO),
+            encode(torch.cat([view.active[:, :3], view.active[:, 6:]], 1)),
+        ]
+
+    def slope_inputs(self, view: View) -> list[Tensor]:
+        return slope_features(view.photo, view.active + view.plane, view.slopes)
+
+    def lobe_inputs(self, view: View) -> list[Tensor]:
+        """Lobes and evidence: albedos and roughness to [-0.5, 1.5], odds halved."""
+        lobes = pad_to(view.batch["lobes"], self.multiple)
+        parts = split_channels(pad_to(view.batch["evidence"], self.multiple), EVIDENCE)
+        scaled = [x / 2 if k.endswith("odds") else 2 * x - 0.5 for k, x in parts.items()]
+        return [2 * lobes - 0.5, *scaled]
+
+    def with_clues(
+        self, x: Tensor, skips: list[Tensor], normal0: Tensor, view: View
+    ) -> tuple[Tensor, list[Tensor]]:
+        """The image encoder's output and skips, joined with those of the clues."""
+        clues, clue_skips = self.clue_encoder(channels_last_cat(self.clue_inputs(normal0, view)))
+        pairs = zip(skips, clue_skips, self.skips, strict=True)
+        skips = [s + conv(k) for s, k, conv in pairs]
+        return self.fuse([x, clues], view), skips
+
+    def fuse(self, bottlenecks: list[Tensor], view: View) -> Tensor:
+        costs: Tensor = self.costs(view.batch["costs"])
+        x: Tensor = self.fusion(channels_last_cat(bottlenecks))
+        return x + costs[..., None, None]
+
+    def clue_inputs(self, normal: Tensor, view: View) -> list[Tensor]:
+        """Inputs of the clue encoder: plane clues, and normal clues, those of the room in grey."""
+        room, screen = self.normal_clues(normal, view, view.batch["screen"])
+        assert screen is not None
+        return [encode(view.plane), encode(grey(room)), encode(screen)]
+
+    def normal_clues(
+        self, normal: Tensor, view: View, screen: Tensor | None
+    ) -> tuple[Tensor, Tensor | None]:
+        """`nets.splitsum.normal_clues` for the view."""
+        batch = view.batch
+        return normal_clues(
+            normal, view.position, view.to_camera, batch["rig"], batch["sky"], screen, self.table,
+            BASIS, ALBEDO,
+        )  # fmt: skip
+
+    def material(self, out: Batch, batch: Batch) -> Batch:
+        """The material maps: means of the network's own and of the photo's two readings."""
+        evidence = unpack_evidence(batch)
+        black = torch.zeros_like(out["diffuse"])
+        cases = {
+            "diffuse": (evidence.dielectric_diffuse, black),
+            "roughness": (evidence.dielectric_roughness, evidence.metal_roughness),
+            "specular": (black + DIELECTRIC_F0, evidence.metal_material_specular),
+        }
+        return {k: _mean(out[k], *pair, out[f"{k}_weights"]) for k, pair in cases.items()}
 
 
-def _scaled(evidence: Tensor) -> Tensor:
-    """Evidence as inputs: albedos and roughness to [-0.5, 1.5], odds halved."""
-    parts = split_channels(evidence, EVIDENCE)
-    return torch.cat([x / 2 if "odds" in k else 2 * x - 0.5 for k, x in parts.items()], 1)
+def grey(images: Tensor) -> Tensor:
+    """Means over the colours of RGB images side by side, (B, 3·n, H, W) to (B, n, H, W)."""
+    return images.unflatten(1, (-1, 3)).mean(2)
+
+
+def _least(name: str) -> float:
+    return MIN_ROUGHNESS if name == "roughness" else 0.0
 
 
 def _mean(own: Tensor, dielectric: Tensor, metal: Tensor, logits: Tensor) -> Tensor:
@@ -257,40 +273,34 @@ def _mean(own: Tensor, dielectric: Tensor, metal: Tensor, logits: Tensor) -> Ten
     return a * own + b * dielectric + c * metal
 
 
-def _knows_environment(config: Config) -> bool:
-    return config.clues not in ("none", "mirrorball")
+def _count(outputs: dict[str, list[float]]) -> int:
+    return sum(len(v) for v in outputs.values())
 
 
-def _channels(config: Config) -> tuple[int, int]:
-    """Input channels of the image encoder and of the clue encoder."""
-    image = 8 + (12 if config.active else 0) + (SLOPE_FEATURES if config.slopes else 0)
-    image += 7 + EVIDENCE_CHANNELS if config.lobes else 0
-    lit = 6 if config.active else 0
-    clue = {
-        "none": 0, "mirrorball": 3, "plane": 12, "full": 16 + lit, "colored": 24 + lit,
-    }[config.clues]  # fmt: skip
-    return image, clue
-
-
-def _last(x: Tensor) -> Tensor:
-    return x.contiguous(memory_format=torch.channels_last)
+def _begin(decoder: Decoder, outputs: dict[str, list[float]]) -> None:
+    """Let a fresh decoder put out its bias and little else."""
+    bias = torch.tensor([x for values in outputs.values() for x in values])
+    with torch.no_grad():
+        decoder.ending.weight *= FRESH_SCALE
+        assert decoder.ending.bias is not None
+        decoder.ending.bias.copy_(bias)
 
 
 def slope_normal(slope: Tensor) -> Tensor:
-    """Unit normals (B, 3, H, W) along (p, q, 1)."""
-    return F.normalize(torch.cat([slope, torch.ones_like(slope[:, :1])], 1), dim=1)
+    """Unit normals (B, 3, H, W) along (p, q, 1) of slopes (B, 2, H, W)."""
+    z = torch.rsqrt((slope * slope).sum(1, keepdim=True) + 1)
+    return torch.cat([slope * z, z], 1)
 
 
-def normalise(batch: Batch, config: Config | None = None) -> Batch:
-    """The batch in units of a white plane's mean radiance; what is not finite becomes black."""
-    lights = ["active_clues"]
-    if config is None or _knows_environment(config):
-        lights.append("env_clues")
-    level = torch.stack([batch[k][:, 9:12].mean((1, 2, 3)) for k in lights]).sum(0) / ALBEDO
+def normalise(batch: Batch, lights: Sequence[str] = ("active_clues", "env_clues")) -> Batch:
+    """The batch in units of the mean radiance of a white plane under ``lights``; what is not finite
+    becomes black."""
+    white = [batch[k][:, WHITE_CLUE].mean((1, 2, 3)) for k in lights]
+    level = torch.stack(white).sum(0) / ALBEDO
     scale = 1 / torch.nan_to_num(level, 1.0).clamp(min=1e-20)
     out = dict(batch)
     for key in ("photo", "target", *LIGHTS):
         if key in batch:
-            x = torch.nan_to_num(batch[key] * scale[:, None, None, None], 0.0, 1e3, 0.0)
-            out[key] = x.clamp(-1e4 if key == "slope_clues" else 0, 1e4)
+            x = torch.nan_to_num(batch[key] * scale[:, None, None, None], 0.0, MAX_PHOTO, 0.0)
+            out[key] = x.clamp(-MAX_RADIANCE if key == "slope_clues" else 0, MAX_RADIANCE)
     return out

@@ -13,40 +13,47 @@ which basis material, and how much of it, to believe.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+
+from nets.clues import SLOPED, WHITE
 
 NEAR = 8  # pixels a side of the neighbourhood
 SLOPE, NOISE = 0.2, 0.01  # standard deviations of slopes and of log I
 ALBEDO_SPREADS = ((0.05, 0.03), (0.3, 0.08))  # those of grey and of colour: plain, and textured
 MATERIALS = ((3, 0), (2, 1))  # place in `BASIS` and in `SLOPED`: white, and rough specular
 SLOPE_FEATURES = 3 + 18 + 4 * len(MATERIALS)
+LEAST_RADIANCE = 1e-3  # that counts as light, in units of a white plane
+MOST_RELATIVE = 100.0  # |g|: a sharp lobe's flank on black
+MOST_SLOPE = 3.0  # 72 degrees
 
 
-def slope_features(photo: Tensor, plane: Tensor, derivatives: Tensor) -> Tensor:
-    """Features (B, SLOPE_FEATURES, H, W) of a photo (B, 3, H, W).
+def slope_features(photo: Tensor, plane: Tensor, derivatives: Tensor) -> list[Tensor]:
+    """Features of a photo (B, 3, H, W), `SLOPE_FEATURES` channels in all.
 
     plane (B, 12, H, W): radiance of the basis materials, lying flat; derivatives (B, 18, H, W):
     slope clues, see `nets.clues.plane_clues`.
     """
-    relative = (derivatives / _order(plane).clamp(min=1e-3)).clamp(-100, 100)
+    base = plane.unflatten(1, (-1, 3))
+    lit = base[:, SLOPED].clamp(min=LEAST_RADIANCE).unsqueeze(1)
+    g = derivatives.unflatten(1, (2, len(SLOPED), 3)) / lit  # along p and q, material, colour
+    g = g.clamp(-MOST_RELATIVE, MOST_RELATIVE)
+    log_photo = torch.log(photo + LEAST_RADIANCE)
     estimates = []
     for material, place in MATERIALS:
-        base = plane[:, 3 * material : 3 * material + 3]
-        ratio = torch.log((photo + 1e-3) / (base + 1e-3))
+        ratio = log_photo - torch.log(base[:, material] + LEAST_RADIANCE)
         detail = ratio - _nearby(ratio)
-        g_p, g_q = (relative[:, k : k + 3] for k in (3 * place, 9 + 3 * place))
-        estimates += [posterior(detail, g_p, g_q, *spreads) for spreads in ALBEDO_SPREADS]
-        if material == 3:
-            estimates.append(detail)
-    return torch.cat([torch.asinh(relative), *(x.clamp(-3, 3) for x in estimates)], 1)
+        found = posteriors(detail, g[:, 0, place], g[:, 1, place], ALBEDO_SPREADS)
+        estimates += found if material != WHITE else [*found, detail]
+    return [asinh(g.flatten(1, 3)), *(x.clamp(-MOST_SLOPE, MOST_SLOPE) for x in estimates)]
 
 
-def _order(plane: Tensor) -> Tensor:
-    """The radiance that each channel of the slope clues is a derivative of."""
-    white, rough, glossy = (plane[:, 3 * m : 3 * m + 3] for m in (3, 2, 0))
-    return torch.cat([white, rough, glossy] * 2, 1)
+def asinh(x: Tensor) -> Tensor:
+    """sign(x)·log(|x| + √(x² + 1)), whose functions torch has vectorised, unlike its own asinh."""
+    return torch.log(x.abs() + torch.sqrt(x * x + 1)).copysign(x)
 
 
 def _nearby(x: Tensor) -> Tensor:
@@ -56,21 +63,23 @@ def _nearby(x: Tensor) -> Tensor:
     return F.interpolate(coarse, (h, w), mode="bilinear", align_corners=False)
 
 
-def posterior(detail: Tensor, g_p: Tensor, g_q: Tensor, grey: float, colour: float) -> Tensor:
-    """Posterior mean (B, 2, H, W) of the slopes, ΣGᵀ(GΣGᵀ + R)⁻¹·detail, with
-    R = grey²·11ᵀ + (colour² + noise²)·1; by the 2 × 2 form (GᵀR⁻¹G + Σ⁻¹)⁻¹GᵀR⁻¹·detail."""
-    own = colour**2 + NOISE**2
-    shared = grey**2 / (own + 3 * grey**2)
-
-    def whitened(a: Tensor, b: Tensor) -> Tensor:
-        """aᵀR⁻¹b by Sherman and Morrison."""
-        product = (a * b).sum(1, keepdim=True)
-        sums = a.sum(1, keepdim=True) * b.sum(1, keepdim=True)
-        return (product - shared * sums) / own
-
-    pp = whitened(g_p, g_p) + SLOPE**-2
-    qq = whitened(g_q, g_q) + SLOPE**-2
-    pq = whitened(g_p, g_q)
-    x, y = whitened(g_p, detail), whitened(g_q, detail)
-    det = pp * qq - pq * pq
-    return torch.cat([qq * x - pq * y, pp * y - pq * x], 1) / det
+def posteriors(
+    detail: Tensor, g_p: Tensor, g_q: Tensor, spreads: Sequence[tuple[float, float]]
+) -> list[Tensor]:
+    """Posterior means (B, 2, H, W) of the slopes, ΣGᵀ(GΣGᵀ + R)⁻¹·detail, with
+    R = grey²·11ᵀ + (colour² + noise²)·1, for each pair of ``spreads`` (grey, colour); by the 2 × 2
+    form (GᵀR⁻¹G + Σ⁻¹)⁻¹GᵀR⁻¹·detail. The images are (B, 3, H, W)."""
+    pairs = {"pp": (g_p, g_p), "qq": (g_q, g_q), "pq": (g_p, g_q), "x": (g_p, detail),
+             "y": (g_q, detail)}  # fmt: skip
+    products = {k: (a * b).sum(1, keepdim=True) for k, (a, b) in pairs.items()}
+    totals = {id(a): a.sum(1, keepdim=True) for a in (g_p, g_q, detail)}
+    sums = {k: totals[id(a)] * totals[id(b)] for k, (a, b) in pairs.items()}
+    found = []
+    for grey, colour in spreads:
+        own = colour**2 + NOISE**2
+        shared = grey**2 / (own + 3 * grey**2)
+        # aᵀR⁻¹b by Sherman and Morrison.
+        pp, qq, pq, x, y = ((products[k] - shared * sums[k]) / own for k in pairs)
+        pp, qq = pp + SLOPE**-2, qq + SLOPE**-2
+        found.append(torch.cat([qq * x - pq * y, pp * y - pq * x], 1) / (pp * qq - pq * pq))
+    return found

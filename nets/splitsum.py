@@ -197,7 +197,8 @@ def brdf_table(size: int = 32, samples: int = 4096) -> Tensor:
 def view_directions(position: Tensor, rig: Tensor) -> Tensor:
     """Unit vectors (B, 3, H, W) to the camera from positions (B, 2, H, W), see `pack_rig`."""
     x = torch.cat([position, torch.zeros_like(position[:, :1])], 1)
-    return F.normalize(rig[:, 0:3, None, None] - x, dim=1)
+    v = rig[:, 0:3, None, None] - x
+    return v * torch.rsqrt((v * v).sum(1, keepdim=True))
 
 
 def reflect(view: Tensor, normal: Tensor) -> Tensor:
@@ -260,6 +261,7 @@ def brdf_factors(n_v: Tensor, roughness: float, table: Tensor) -> tuple[Tensor, 
 def normal_clues(
     normal: Tensor,
     position: Tensor,
+    to_camera: Tensor,
     rig: Tensor,
     sky: Tensor,
     screen: Tensor | None,
@@ -269,15 +271,14 @@ def normal_clues(
 ) -> tuple[Tensor, Tensor | None]:
     """Radiance of the basis materials (ρ, k_d), k_s = albedo - k_d, with these normals.
 
-    normal (B, 3, H, W), unit; position (B, 2, H, W); rig (B, 12); sky (B, 3·(R + 1), S, S): for
-    each roughness in the order in which the basis first names it, then E/π; screen likewise
-    without E, or None. Returns the environment's images (B, 3·len(basis), H, W) and the specular
-    images of the screen (B, 3·R, H, W).
+    normal, to_camera (B, 3, H, W), unit; position (B, 2, H, W); rig (B, 12); sky
+    (B, 3·(R + 1), S, S): for each roughness in the order in which the basis first names it, then
+    E/π; screen likewise without E, or None. Returns the environment's images (B, 3·len(basis), H,
+    W) and the specular images of the screen (B, 3·R, H, W).
     """
     levels = list(dict.fromkeys(rho for rho, _ in basis))
-    view = view_directions(position, rig)
-    mirror = reflect(view, normal)
-    n_v = (normal * view).sum(1, keepdim=True).clamp(1e-3, 1)
+    mirror = reflect(to_camera, normal)
+    n_v = (normal * to_camera).sum(1, keepdim=True).clamp(1e-3, 1)
     factors = {rho: brdf_factors(n_v, rho, table) for rho in levels}
     light = look_up_sky(sky[:, : 3 * len(levels)], mirror).chunk(len(levels), 1)
     diffuse = look_up_sky(sky[:, 3 * len(levels) :], normal)

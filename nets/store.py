@@ -3,51 +3,62 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
 import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
+from torch import nn
 
 from invrender.types import InputError
 from nets.correction import Correction
 from nets.model import Config, Network
 
-PRESETS = {
-    "small": Config(),
-    "paper": Config(
-        32, (2, 2, 4, 8), 12, (2, 2, 2, 2),
-        active=False, slopes=False, lobes=False, clue_skips=False, narrow_fusion=False,
-        denoiser=True,
-    ),
-    "tiny": Config(8, (1, 1), 1, (1, 1)),  # for tests
-    "correction": Config(16, (1, 1, 2), 2, (1, 1, 1), correction=True),
+AnyNetwork = Network | Correction
+
+KINDS: dict[str, type[Network] | type[Correction]] = {
+    "network": Network,
+    "correction": Correction,
+}
+PRESETS: dict[str, tuple[str, Config]] = {
+    "small": ("network", Config()),
+    "tiny": ("network", Config(8, (1, 1), 1, (1, 1))),  # for tests
+    "correction": ("correction", Config(16, (1, 1, 2), 2, (1, 1, 1))),
+}
+
+# In headers of version 0.1: what was built in besides `Config`'s sizes. Other values were ablations
+# (now `benchmarks.ablations`). "correction" told the kind.
+SWITCHES_0_1 = {
+    "clues": "full", "active": True, "slopes": True, "lobes": True, "clue_skips": True,
+    "narrow_fusion": True, "denoiser": False,
 }  # fmt: skip
 
 
-AnyNetwork = Network | Correction
-
-
-def _fresh(config: Config) -> AnyNetwork:
-    network = (Correction if config.correction else Network)(config)
-    return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-
-
-def build(name: str, **changes: Any) -> AnyNetwork:
-    """A network from `PRESETS`, with fields of `Config` changed, in the channels-last layout."""
+def build(name: str) -> AnyNetwork:
+    """A fresh network from `PRESETS`, in the channels-last layout."""
     if name not in PRESETS:
         raise InputError(f"no preset {name!r}; there are {', '.join(PRESETS)}")
-    return _fresh(replace(PRESETS[name], **changes))
+    kind, config = PRESETS[name]
+    return channels_last(KINDS[kind](config))
 
 
-def save_weights(
-    path: Path, network: AnyNetwork, notes: dict[str, Any], half: bool = False
-) -> None:
-    """Write safetensors with the `Config` and ``notes`` as JSON in its header."""
+def channels_last(network: Any) -> Any:
+    """The same network with its weights in the channels-last layout, as all activations are."""
+    return network.to(memory_format=torch.channels_last)
+
+
+def save_weights(path: Path, network: nn.Module, notes: dict[str, Any], half: bool = False) -> None:
+    """Write safetensors with the network's kind, `Config` and ``notes`` in its header."""
+    assert isinstance(network.config, Config)
+    kinds = [k for k, kind in KINDS.items() if type(network) is kind]
+    metadata = {
+        "kind": kinds[0] if kinds else type(network).__name__,
+        "config": json.dumps(asdict(network.config)),
+        "notes": json.dumps(notes),
+    }
     tensors = {k: (v.half() if half else v).contiguous() for k, v in network.state_dict().items()}
-    metadata = {"config": json.dumps(asdict(network.config)), "notes": json.dumps(notes)}
     part = path.with_suffix(".part")
     save_file(tensors, part, metadata=metadata)
     part.replace(path)
@@ -58,14 +69,32 @@ def load_weights(path: Path) -> tuple[AnyNetwork, dict[str, Any]]:
     try:
         with safe_open(path, "pt") as f:
             metadata = f.metadata() or {}
-        fields = json.loads(metadata["config"])
-        changes: dict[str, Any] = {k: tuple(v) if type(v) is list else v for k, v in fields.items()}
-        network = _fresh(Config(**changes))
+        kind, config = _described(metadata)
+        if kind not in KINDS:
+            raise InputError(f"{path} holds an ablation's weights ({kind}), for benchmarks alone")
+        network = channels_last(KINDS[kind](config))
         network.load_state_dict({k: v.float() for k, v in load_file(path).items()})
     except (OSError, KeyError, TypeError, ValueError, RuntimeError) as e:
+        if isinstance(e, InputError):
+            raise
         raise InputError(f"{path} holds no weights of this program: {e}") from None
     except Exception as e:  # safetensors has its own error class
         if type(e).__name__ != "SafetensorError":
             raise
         raise InputError(f"{path} is not a safetensors file: {e}") from None
     return network.eval(), json.loads(metadata.get("notes", "{}"))
+
+
+def _described(metadata: dict[str, str]) -> tuple[str, Config]:
+    """Kind and sizes of the network that a header describes."""
+    values = json.loads(metadata["config"])
+    sizes: dict[str, Any] = {f.name: values[f.name] for f in fields(Config)}
+    for name in ("encoder", "decoder"):
+        sizes[name] = tuple(sizes[name])
+    config = Config(**sizes)
+    if "kind" in metadata:
+        return metadata["kind"], config
+    if values["correction"]:
+        return "correction", config
+    changed = [k for k, v in SWITCHES_0_1.items() if values.get(k, v) != v]
+    return " and ".join(changed) or "network", config

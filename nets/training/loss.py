@@ -8,13 +8,12 @@ import torch
 from torch import Tensor
 
 from nets.batch import Batch
-from nets.model import MAPS, Config, encode, normalise
+from nets.model import MAPS
 
 # Spread of each map over the training data: the error of a constant guess. Errors are measured in
 # it, so that normals (small) and roughness (smooth) weigh as much as albedos from the start.
 SPREAD = {"normal": 0.065, "diffuse": 0.19, "roughness": 0.26, "specular": 0.17}
 NORMAL0_WEIGHT = 0.5
-DENOISED_WEIGHT = 0.5
 SIGMA_WEIGHT = 0.1
 
 
@@ -22,9 +21,9 @@ def truth(batch: Batch) -> dict[str, Tensor]:
     """Maps as errors are measured, normals encoded to [0, 1], from a batch's bytes."""
     maps = batch["maps"].float() / 255
     xy = maps[:, :2] * 2 - 1
-    z = torch.sqrt((1 - (xy**2).sum(1, keepdim=True)).clamp(min=1e-4))
-    n = torch.cat([xy, z], 1)
-    n = n / n.norm(dim=1, keepdim=True)
+    square = (xy * xy).sum(1, keepdim=True)
+    z2 = (1 - square).clamp(min=1e-4)
+    n = torch.cat([xy, z2.sqrt()], 1) * torch.rsqrt(square + z2)
     return {
         "normal": n / 2 + 0.5,
         "diffuse": maps[:, 2:5],
@@ -48,7 +47,7 @@ def compare(out: Batch, batch: Batch) -> dict[str, tuple[Tensor, Tensor]]:
     return result
 
 
-def total_loss(out: Batch, batch: Batch, config: Config) -> tuple[Tensor, Batch]:
+def total_loss(out: Batch, batch: Batch) -> tuple[Tensor, Batch]:
     """The loss, and it and its parts as numbers without gradients.
 
     Per map: mean |error| and mean squared error in units of `SPREAD`; L1 on the initial normals;
@@ -69,8 +68,5 @@ def total_loss(out: Batch, batch: Batch, config: Config) -> tuple[Tensor, Batch]
         error = (out["normal0"] / 2 + 0.5 - b["normal"]) / SPREAD["normal"]
         parts["normal0"] = NORMAL0_WEIGHT * error.abs().mean()
     parts["sigma"] = SIGMA_WEIGHT * sigma_loss
-    if "denoised" in out:
-        ideal = encode(normalise({**batch, "target": batch["ideal"].float()}, config)["target"])
-        parts["denoised"] = DENOISED_WEIGHT * 10 * (out["denoised"] - ideal).abs().mean()
     total = torch.stack(list(parts.values())).sum()
     return total, {k: v.detach() for k, v in (*parts.items(), ("loss", total))}
