@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from invrender.files.exif import lens
-from invrender.files.raster import Raster, clip_level, decode
+from invrender.files.raster import Raster, clip_level, decode, oriented
 from invrender.types import Array, InputError, Notice
 
 RAW = (
@@ -78,6 +78,13 @@ def read_image(path: Path, *, linear: bool = False) -> Array:
     image = decode(raster, data=linear)
     _check_finite(path, raster, image)
     return image
+
+
+def read_alpha(path: Path) -> Array:
+    """The alpha channel (H, W) of an image, upright, in [0, 1]; ones where it has none."""
+    raster = _read(Path(path))
+    alpha = np.ones(raster.data.shape[:2]) if raster.alpha is None else raster.alpha
+    return np.ascontiguousarray(oriented(alpha, raster.orientation), np.float32)
 
 
 def read_photo(path: Path) -> Photo:

@@ -4,7 +4,10 @@ A file's role is the last word of its name (resolution and format words aside), 
 our own four EXR files; ``basecolor normal roughness [metallic]``; ambientCG's ``*_Color
 *_NormalGL *_NormalDX *_Roughness *_Metalness``; Poly Haven's ``*_diff_1k *_nor_gl_1k *_rough_1k
 *_metal_1k`` or ``*_arm_1k``; MatSynth's ``basecolor diffuse specular normal roughness metallic``;
-``diffuse specular roughness|glossiness normal``.
+``diffuse specular roughness|glossiness normal``; Poliigon's ``*_COL_2K_METALNESS``; Unreal's
+``T_*_BC T_*_N T_*_ORM``; Unity's
+``*_Albedo *_SpecularSmoothness *_Normal``, whose albedo counts 1 - max(k_s) times; one letter,
+``*_d *_n *_r``; and the same in CamelCase.
 """
 
 from __future__ import annotations
@@ -17,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from invrender.data.materials.augment import check_maps
-from invrender.files.images import read_image
+from invrender.files.images import read_alpha, read_image
 from invrender.files.maps import read_maps
 from invrender.maps import NAMES, Maps, resize_maps
 from invrender.sampling import resize
@@ -25,34 +28,49 @@ from invrender.types import Array, InputError
 
 log = logging.getLogger("invrender")
 
+DECISIVE = 0.35  # of `handedness`, from which the slopes tell
 SUFFIXES = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg")  # the best first
 
 _ROLES = {
-    "basecolor": "basecolor basecolour albedo color colour col base",
-    "diffuse": "diffuse diff",
-    "specular": "specular spec speccolor specularcolor reflectance",
-    "normal": "normal normals nor nrm norm normalgl normaldx normalogl",
+    "basecolor": "basecolor basecolour albedo color colour col base bc basemap diffusecolor alb",
+    "diffuse": "diffuse diff dif",
+    "specular": "specular spec speccolor specularcolor reflectance reflection refl",
+    "normal": "normal normals nor nrm norm normalgl normaldx normalogl nm normalmap",
     "roughness": "roughness rough rgh",
     "gloss": "gloss glossiness smoothness",
-    "metallic": "metallic metalness metal met metallness",
+    "metallic": "metallic metalness metal met metallness mtl",
     "arm": "arm orm",
+    "specular_gloss": "specularsmoothness specularglossiness",  # smoothness in the alpha channel
 }
 _ROLE = {word: role for role, words in _ROLES.items() for word in words.split()}
+# One letter after a material's name; an explicit word is preferred.
+_LETTER = {"d": "diffuse", "c": "basecolor", "n": "normal", "r": "roughness", "m": "metallic",
+           "g": "gloss"}  # fmt: skip
 _GL = {"gl", "opengl", "ogl", "normalgl", "normalogl"}
 _DX = {"dx", "directx", "normaldx"}
-_IGNORED = re.compile(r"\d+k|\d+x\d+|jpe?g|png|exr|tiff?|\d+bit")
-_NOT_BASE = {"emission", "emissive", "subsurface", "sheen", "coat", "mask", "id"}
+_IGNORED = re.compile(r"\d+k|\d+x\d+|jpe?g|png|exr|tiff?|\d+bit|map|tex|texture|var\d+|\d+")
+_NOT_BASE = {"emission", "emissive", "subsurface", "sheen", "coat", "mask", "id", "scatter"}
+_UNREAL = re.compile(r"t_.+_n", re.IGNORECASE)  # Unreal's own names; its normals are DirectX
 
 
 def _words(path: Path) -> list[str]:
-    words = [w for w in re.split(r"[\s_\-.]+", path.stem.lower()) if w]
+    """The name's words in lower case, without those of resolution, format and workflow."""
+    text = re.sub(r"(?i)open_?gl", "_opengl_", path.stem)
+    text = re.sub(r"(?i)direct_?x", "_directx_", text)
+    if not _ROLE.get(re.split(r"[\s_\-.]+", text.lower())[-1]):
+        # WoodBaseColor; a word such as NormalGL stays one.
+        text = re.sub(r"(?<=[a-z0-9])(?=[A-Z][a-z])", "_", text)
+    words = [w for w in re.split(r"[\s_\-.]+", text.lower()) if w] or [""]
+    # Poliigon: NAME_COL_2K_METALNESS, NAME_REFL_2K_SPECULAR.
+    if len(words) > 2 and words[-1] in ("metalness", "specular") and words[-2].endswith("k"):
+        words.pop()
     while len(words) > 1 and _IGNORED.fullmatch(words[-1]):
         words.pop()
     return words
 
 
-def _role(path: Path) -> tuple[str, str]:
-    """The role of a file, or "", and for normals "gl", "dx" or "" where the name is silent."""
+def _role(path: Path) -> tuple[str, str, bool]:
+    """(role of a file or "", "gl", "dx" or "" where a normal map's name is silent, one letter)."""
     words = _words(path)
     handed = ""
     if words[-1] in _GL | _DX:
@@ -62,23 +80,33 @@ def _role(path: Path) -> tuple[str, str]:
     before = words[-2] if len(words) > 1 else ""
     if role == "basecolor" and words[-1] in ("color", "colour", "col"):
         if before in _NOT_BASE:
-            return "", ""
+            return "", "", False
         role = {"diffuse": "diffuse", "specular": "specular"}.get(before, role)
+    if role == "gloss" and before == "specular":
+        role = "specular_gloss"
+    letter = not role and len(words) > 1 and words[-1] in _LETTER
+    if letter:
+        role = _LETTER[words[-1]]
     if handed and role not in ("normal",):
-        return "", ""
-    return role, handed
+        return "", "", False
+    return role, handed, letter
 
 
 def material_files(folder: Path) -> dict[str, Path]:
     """The files of a folder by role; of several for one role the best: OpenGL, EXR, PNG first."""
-    found: dict[str, tuple[tuple[int, int, str], Path]] = {}
+    found: dict[str, tuple[tuple[bool, int, int, str], Path]] = {}
     for path in sorted(Path(folder).iterdir()):
         if path.suffix.lower() not in SUFFIXES or not path.is_file():
             continue
-        role, handed = _role(path)
+        role, handed, letter = _role(path)
         if not role:
             continue
-        rank = ({"gl": 0, "": 1, "dx": 2}[handed], SUFFIXES.index(path.suffix.lower()), path.name)
+        rank = (
+            letter,
+            {"gl": 0, "": 1, "dx": 2}[handed],
+            SUFFIXES.index(path.suffix.lower()),
+            path.name,
+        )
         if role not in found or rank < found[role][0]:
             found[role] = rank, path
     return {role: path for role, (_, path) in found.items()}
@@ -129,7 +157,7 @@ def read_material(folder: Path, max_size: int = 4096) -> Maps:
     for role, alternatives in (
         ("colour", ("basecolor", "diffuse")),
         ("normal", ("normal",)),
-        ("roughness", ("roughness", "gloss", "arm")),
+        ("roughness", ("roughness", "gloss", "arm", "specular_gloss")),
     ):
         if not files.keys() & set(alternatives):
             raise InputError(f"{folder} has no {role} map")
@@ -149,9 +177,13 @@ def read_material(folder: Path, max_size: int = 4096) -> Maps:
             log.info("%s: resized from %d × %d to %d × %d", files[role], w, h, size[1], size[0])
         return resize(image, *size)
 
+    unity = "specular_gloss" in files and not files.keys() & {"metallic", "arm"}
     workflow = "basecolor" not in files and "specular" in files and "metallic" not in files
     colour = np.clip(load("basecolor" if "basecolor" in files else "diffuse", False), 0, 1)
-    if workflow:
+    if unity:
+        specular = np.clip(load("specular_gloss", False), 0, 1)
+        diffuse = colour * (1 - specular.max(-1, keepdims=True))
+    elif workflow:
         diffuse, specular = colour, np.clip(load("specular", False), 0, 1)
     else:
         if "metallic" in files:
@@ -166,10 +198,14 @@ def read_material(folder: Path, max_size: int = 4096) -> Maps:
         rough = load("roughness", True).mean(-1)
     elif "gloss" in files:
         rough = 1 - load("gloss", True).mean(-1)
+    elif unity:
+        rough = 1 - resize(read_alpha(files["specular_gloss"]), *colour.shape[:2])
     else:
         rough = load("arm", True)[..., 1]
     normal = decode_normals(load("normal", True), files["normal"])
     handed = _role(files["normal"])[1]
+    if not handed and _UNREAL.fullmatch(files["normal"].stem):
+        handed = "gl" if handedness(normal) > DECISIVE else "dx"
     if handed == "dx" or (not handed and is_directx(normal)):
         why = "by its name" if handed else "as its slopes show"
         log.info("%s is a DirectX normal map (%s); turned into OpenGL", files["normal"], why)
@@ -221,7 +257,7 @@ def handedness(normal: Array) -> float:
 
 def is_directx(normal: Array) -> bool:
     """True only where the curl test is decisive, see `handedness`."""
-    return handedness(normal) < -0.35
+    return handedness(normal) < -DECISIVE
 
 
 def load_materials(

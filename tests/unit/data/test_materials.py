@@ -297,6 +297,20 @@ LAYOUTS = {
         "rusty_metal_05_rough_1k.png",
     ),
     "generic": ("wall_albedo.png", "wall_nrm.png", "wall_roughness.tif"),
+    "camel": ("WallBaseColor.png", "WallNormal.png", "WallRoughness.png"),
+    "camel and numbers": ("Wall01BaseColor.png", "Wall01NormalOpenGL.png", "Wall01Roughness.png"),
+    "letters": ("wall_d.png", "wall_n.png", "wall_r.png"),
+    "substance": ("Wall_Base_Color.png", "Wall_Normal_OpenGL.png", "Wall_Roughness.png"),
+    "texturecan": ("wall_color_4k.png", "wall_normal_opengl_4k.png", "wall_roughness_4k.png"),
+    "poliigon": (
+        "Wall_COL_2K_METALNESS.png",
+        "Wall_NRM_2K_METALNESS.png",
+        "Wall_ROUGHNESS_2K_METALNESS.png",
+    ),
+    "poliigon's variants": ("Wall_COL_VAR1_3K.png", "Wall_NRM_3K.png", "Wall_ROUGHNESS_3K.png"),
+    "megascans": ("vlkh_4K_Albedo.png", "vlkh_4K_Normal.png", "vlkh_4K_Roughness.png"),
+    "freepbr": ("wall-albedo.png", "wall-normal-ogl.png", "wall-rough.png"),
+    "maps": ("Wall_BaseMap.png", "Wall_NormalMap.png", "Wall_RoughnessMap.png"),
 }
 
 
@@ -309,6 +323,42 @@ def test_layouts(tmp_path, layout):
     assert np.abs(maps.roughness - truth.roughness).max() < 0.003
     assert np.abs(maps.normal - truth.normal).max() < 0.02
     assert find_materials(tmp_path) == [tmp_path]
+
+
+@pytest.mark.parametrize("target", ["unreal", "unity", "blender", "godot"])
+@pytest.mark.parametrize("convention", ["opengl", "directx"])
+def test_our_own_exports_are_read(tmp_path, target, convention):
+    from invrender.export import export
+
+    hilly = maps_of(hills(64))
+    truth = replace(hilly, diffuse=hilly.diffuse * 0.9, specular=np.full_like(hilly.diffuse, 0.04))
+    (tmp_path / "maps").mkdir()
+    write_maps(tmp_path / "maps", truth)
+    export(tmp_path / "maps", tmp_path / "out", target, normal_convention=convention)
+    folder = next(p.parent for p in (tmp_path / "out").rglob("*") if p.suffix == ".png")
+    maps = read_material(folder)
+    assert np.abs(maps.diffuse - truth.diffuse).max() < 0.02
+    assert np.abs(maps.specular - truth.specular).max() < 0.01
+    assert np.abs(maps.roughness - truth.roughness).max() < 0.006
+    assert np.abs(maps.normal - truth.normal).max() < 0.02
+
+
+def test_unreal_normals_without_a_clear_side_are_directx(tmp_path):
+    up = np.full((16, 16, 3), 0.5)
+    up[..., 1], up[..., 2] = 0.6, 0.99
+    for name, image in (("BC", 0.5 + 0 * up), ("N", up), ("ORM", 0.5 + 0 * up)):
+        save(tmp_path / f"T_Wall_{name}.png", image)
+    assert read_material(tmp_path).normal[..., 1].max() < 0
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["Wall_EmissionColor", "wall_id", "Wall_AmbientOcclusion", "wall_h", "wall", "readme_4k"],
+)
+def test_other_files_play_no_role(tmp_path, name):
+    truth = write_set(tmp_path, LAYOUTS["letters"])
+    save(tmp_path / f"{name}.png", np.ones(truth.shape))
+    assert np.abs(read_material(tmp_path).diffuse - truth.diffuse).max() < 0.01
 
 
 def test_metals_convert(tmp_path):
