@@ -1,6 +1,7 @@
 """Procedural materials, readers of material folders, and augmentation."""
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -325,8 +326,11 @@ def test_layouts(tmp_path, layout):
     assert find_materials(tmp_path) == [tmp_path]
 
 
-@pytest.mark.parametrize("target", ["unreal", "unity", "blender", "godot"])
-@pytest.mark.parametrize("convention", ["opengl", "directx"])
+@pytest.mark.parametrize(
+    ("target", "convention"),
+    [(t, c) for t in ("unreal", "unity", "blender") for c in ("opengl", "directx")]
+    + [("godot", "opengl"), ("ambientcg", "directx"), ("polyhaven", "directx")],
+)
 def test_our_own_exports_are_read(tmp_path, target, convention):
     from invrender.export import export
 
