@@ -349,7 +349,7 @@ def main(args: argparse.Namespace) -> None:
             best = min(p[1] for p in curve)
             print(f"{folder.name} {name}: {curve[0][1]:.4f} → {best:.4f}", flush=True)
     bars = []
-    for baseline, least in (("Adam, Mitsuba prb", 30.0), ("Adam, PyTorch", 5.0)):
+    for baseline, least in (("Adam, Mitsuba prb", 50.0), ("Adam, PyTorch", 5.0)):
         for method in ("Gauss–Newton", "correction, cautious step"):
             ratio = float(np.median([faster(c, method, baseline) for c in results.values()]))
             name = f"{method}: times faster than {baseline} to its best map error, median"

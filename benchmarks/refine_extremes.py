@@ -10,31 +10,25 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import time
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.common.results import benchmark_parser, table, write_results
+from benchmarks.common.results import Bar, bar, benchmark_parser, table, write_results
+from invrender.capture.lights import known_lights
 from invrender.data.environments import procedural_environment
+from invrender.files.capture import Capture
+from invrender.files.images import Photo
 from invrender.maps import Maps, constant_maps, map_errors
 from invrender.pattern.default import default_pattern
-from invrender.pipeline import BAKED, POOR_FIT
-from invrender.refine.cautious import correct
+from invrender.pipeline import BAKED, POOR_FIT, Seen, Stages, recover
 from invrender.refine.checks import baked_light, coarse_error, photo_error
-from invrender.refine.flat import flat_maps
-from invrender.refine.gauss_newton import Shot, refine
-from invrender.refine.lobes import fit_lobes
-from invrender.refine.priors import lobe_prior, network_prior
-from invrender.refine.theta import project, to_theta
 from invrender.render import Fast
 from invrender.render.scene import make_scene
 from invrender.rig import Rig
 from invrender.sphere import scale_environment
-from nets.predict import Corrector, Reconstructor
 
 Array = NDArray[np.floating[Any]]
 RIG, GAIN, PATTERN = Rig(), 2.0, default_pattern()
@@ -99,36 +93,21 @@ def photograph(case: Case, seed: int) -> tuple[Array, NDArray[np.bool_] | None]:
     return np.minimum(photo, np.float32(white)), photo.max(-1) >= white
 
 
-@lru_cache(maxsize=1)
-def networks() -> tuple[Reconstructor, Corrector]:
-    return Reconstructor(), Corrector()
-
-
 def run(case: Case, seed: int, init: str) -> dict[str, Any]:
     """Photograph a case and refine it."""
     photo, clipped = photograph(case, seed)
-    began = time.perf_counter()
-    renderer = Fast(make_scene(RIG, PATTERN, case.environment, GAIN))
-    shot = Shot(photo, renderer, clipped)
-    if init == "flat":
-        start = flat_maps(photo, renderer)
-        prior = lobe_prior(fit_lobes(photo, renderer))
-        result = refine([shot], prior)
-    else:
-        reconstruct, improve = networks()
-        estimate = reconstruct(photo, RIG, PATTERN, GAIN, case.environment)
-        start = estimate.maps
-        estimate = improve(photo, renderer, estimate, clipped)
-        prior = network_prior(estimate.maps, estimate.sigma)
-        result = correct([shot], prior)
-    seconds = time.perf_counter() - began
+    mask = np.zeros(photo.shape[:2], bool) if clipped is None else clipped
+    room = np.zeros((64, 128, 3), np.float32) if case.environment is None else case.environment
+    capture = Capture(Photo(photo), RIG, PATTERN)
+    seen = Seen(capture, None, known_lights(capture, room, GAIN), photo, mask)
+    stage = Stages()
+    start, result, shots = recover([seen], stage, init=init)
+    renderer = shots[0].renderer
     images = [*result.maps.encoded().values(), result.sigma]
     before, after = map_errors(start, case.maps), map_errors(result.maps, case.maps)
     baked = baked_light(result.maps.diffuse, renderer)
-    mask = np.zeros(photo.shape[:2], bool) if clipped is None else clipped
     shown = renderer.render(result.maps, 256)
     coarse = coarse_error(shown, photo, mask)
-    moved = np.abs(to_theta(result.maps) - project(prior.mean.copy())).max(-1)
     return {
         "initial": before,
         "refined": after,
@@ -140,8 +119,7 @@ def run(case: Case, seed: int, init: str) -> dict[str, Any]:
         "warns": not result.converged or coarse > POOR_FIT[init] or baked > BAKED,
         "finite": bool(all(np.isfinite(i).all() for i in images)),
         "greatest albedo": float((result.maps.diffuse + result.maps.specular).max()),
-        "moved where clipped": float(moved[mask].max()) if clipped is not None else None,
-        "seconds": seconds,
+        "seconds": sum(stage.seconds.values()),
     }
 
 
@@ -165,4 +143,17 @@ def main(args: argparse.Namespace) -> None:
     names = [*next(iter(results.values()))["initial"]]
     header = ["case", "start", *names, "photo error", "coarse", "light in albedo", "steps"]
     header += ["converged", "seconds"]
-    write_results(args.out, {"cases": results}, {"cases": table(header, rows)})
+    content = {"cases": results, "bars": bars(results)}
+    write_results(args.out, content, {"cases": table(header, rows)})
+
+
+def bars(results: dict[str, Any]) -> list[Bar]:
+    """A start from the networks should end no worse than a flat one; nothing may be infinite."""
+    ends = {name: r["refined"]["average"] for name, r in results.items()}
+    worse = [n for n in ends if n.endswith(", network")
+             and ends[n] > ends[n.removesuffix("network") + "flat"]]  # fmt: skip
+    infinite = sum(not r["finite"] for r in results.values())
+    return [
+        bar("cases that end worse from the networks than from flat", len(worse), 0, False),
+        bar("runs with a number that is not finite", infinite, 0, False),
+    ]
