@@ -11,7 +11,15 @@ from pathlib import Path
 
 import numpy as np
 
-from invrender.export.material import Material, height_texture, normal_texture, normals_seen
+from invrender.export.blender_script import SCRIPT
+from invrender.export.cycles import principled
+from invrender.export.material import (
+    Material,
+    height_range,
+    height_texture,
+    normal_texture,
+    normals_seen,
+)
 from invrender.export.metalrough import (
     WHITE_F0,
     MetalRough,
@@ -19,7 +27,7 @@ from invrender.export.metalrough import (
     metal_rough,
     with_grey_f0,
 )
-from invrender.export.textures import Texture, write_textures
+from invrender.export.textures import SUFFIXES, Texture, write_textures
 from invrender.maps import Maps
 from invrender.types import Array, InputError
 
@@ -68,38 +76,67 @@ POLYHAVEN = Naming(
 def write_blender(
     material: Material, folder: Path, format: str, convention: str
 ) -> dict[str, Maps]:
-    """Write a set of `BLENDER`'s names."""
-    return {"Principled BSDF": write_metal_rough(material, folder, format, convention, BLENDER)}
+    """Write a set of `BLENDER`'s names, and ``NAME.py`` with ``NAME_kd`` and ``NAME_ks``, of which
+    it makes our own reflectance in Blender."""
+    maps, name = material.maps, material.name
+    mr, rough, normal = write_metal_rough(material, folder, format, convention, BLENDER)
+    albedos = {
+        f"{name}_kd": Texture(maps.diffuse, colour=True),
+        f"{name}_ks": Texture(maps.specular, colour=True),
+    }
+    seen = write_textures(folder, albedos, format, material.width)
+    diffuse, specular = seen.values()
+    script = SCRIPT.format(
+        name=name,
+        suffix=SUFFIXES[format],
+        sides=material.sides,
+        colour="Linear Rec.709" if format == "exr" else "sRGB",
+        green_up=convention == "opengl",
+        height=None if material.height is None else height_range(material.height),
+    )
+    (folder / f"{name}.py").write_text(script, encoding="utf-8")
+    return {
+        f"{name}.py": Maps(diffuse, specular, rough, normal),
+        "Principled BSDF": principled(mr, rough, normal),
+    }
 
 
 def write_unreal(material: Material, folder: Path, format: str, convention: str) -> dict[str, Maps]:
     """Write a set of `UNREAL`'s names."""
-    return {"default lit": write_metal_rough(material, folder, format, convention, UNREAL)}
+    return {
+        "default lit": maps_of(*write_metal_rough(material, folder, format, convention, UNREAL))
+    }
 
 
 def write_godot(material: Material, folder: Path, format: str, convention: str) -> dict[str, Maps]:
     """Write a set of `GODOT`'s names."""
-    return {"ORMMaterial3D": write_metal_rough(material, folder, format, convention, GODOT)}
+    return {
+        "ORMMaterial3D": maps_of(*write_metal_rough(material, folder, format, convention, GODOT))
+    }
 
 
 def write_ambientcg(
     material: Material, folder: Path, format: str, convention: str
 ) -> dict[str, Maps]:
     """Write a set named as ambientCG names its own: ``NAME_1K-PNG_Color``."""
-    return {"metal-rough": write_metal_rough(material, folder, format, convention, AMBIENTCG)}
+    return {
+        "metal-rough": maps_of(*write_metal_rough(material, folder, format, convention, AMBIENTCG))
+    }
 
 
 def write_polyhaven(
     material: Material, folder: Path, format: str, convention: str
 ) -> dict[str, Maps]:
     """Write a set named as Poly Haven names its own: ``NAME_diff_1k``."""
-    return {"metal-rough": write_metal_rough(material, folder, format, convention, POLYHAVEN)}
+    return {
+        "metal-rough": maps_of(*write_metal_rough(material, folder, format, convention, POLYHAVEN))
+    }
 
 
 def write_metal_rough(
     material: Material, folder: Path, format: str, convention: str, naming: Naming
-) -> Maps:
-    """Write a metal-rough set; returns the maps that a reader of it sees."""
+) -> tuple[MetalRough, Array, Array]:
+    """Write a metal-rough set; returns the material, roughness and normals that a reader sees."""
     maps = material.maps
     mr = with_grey_f0(maps, WHITE_F0) if naming.specular else metal_rough(maps)
     textures = {
@@ -134,7 +171,7 @@ def write_metal_rough(
     if naming.orm:
         seen["roughness"], seen["metallic"] = seen["orm"][..., 1], seen["orm"][..., 2]
     f0 = seen["specular"] * WHITE_F0 if naming.specular else mr.f0
-    return maps_of(
+    return (
         MetalRough(seen["base"], seen["metallic"], f0),
         seen["roughness"],
         normals_seen(seen["normal"], convention),

@@ -17,8 +17,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from invrender.cli.main import EXAMPLE, main
+from invrender.cli.main import main
 from invrender.colour import linear_to_srgb
+from invrender.data import EXAMPLE
 from invrender.files.images import read_image
 from invrender.files.maps import read_maps
 from invrender.maps import NAMES
