@@ -26,9 +26,9 @@ from invrender.files.images import read_image
 from invrender.files.write import write_exr
 from invrender.pattern.default import block_pattern, default_pattern
 from invrender.pattern.design import (
-    CELLS,
     DARKEST,
     NAMES,
+    PATTERN_CELLS,
     Criterion,
     draw_population,
     measure_responses,
@@ -44,8 +44,8 @@ EARLIER = 0.8  # of white's map error, that a network under the pattern may have
 
 
 def candidates(extra: list[Path]) -> dict[str, Array]:
-    """Patterns (CELLS, CELLS, 3) to compare, and files."""
-    u = (np.arange(CELLS) + 0.5) / CELLS
+    """Patterns (PATTERN_CELLS, PATTERN_CELLS, 3) to compare, and files."""
+    u = (np.arange(PATTERN_CELLS) + 0.5) / PATTERN_CELLS
     x, y = np.meshgrid(u, u[::-1])
     one = np.ones_like(x)
     shapes = {
@@ -53,12 +53,14 @@ def candidates(extra: list[Path]) -> dict[str, Array]:
         "gradient": np.stack([x, y, (1 - x + 1 - y) / 2], -1),
         "stripes": np.stack([0.5 + 0.5 * np.sin(8 * np.pi * x + 2.1 * k) for k in range(3)], -1),
         "step edge": np.stack([one * (x < 0.5), one * (y < 0.5), one * (x >= 0.5)], -1),
-        "random colours": np.random.default_rng(0).uniform(size=(CELLS, CELLS, 3)),
-        "colour blocks": resize_pattern(block_pattern(), CELLS),
+        "random colours": np.random.default_rng(0).uniform(size=(PATTERN_CELLS, PATTERN_CELLS, 3)),
+        "colour blocks": resize_pattern(block_pattern(), PATTERN_CELLS),
         "hue wheel": wheel(),
-        "default": resize_pattern(default_pattern(), CELLS),
+        "default": resize_pattern(default_pattern(), PATTERN_CELLS),
     }
-    shapes |= {p.parent.name + "/" + p.stem: resize_pattern(read_image(p), CELLS) for p in extra}
+    shapes |= {
+        p.parent.name + "/" + p.stem: resize_pattern(read_image(p), PATTERN_CELLS) for p in extra
+    }
     return {k: np.clip(p, DARKEST, 1) for k, p in shapes.items()}
 
 

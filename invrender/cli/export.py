@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from invrender.export import Exported
 
-TARGETS = (
+EXPORT_TARGETS = (
     "gltf", "usd", "materialx", "blender", "unreal", "unity", "godot", "ambientcg", "polyhaven",
     "mitsuba",
 )  # fmt: skip
@@ -31,7 +31,7 @@ def add_parser(commands: Any) -> None:
     parser.add_argument(
         "result", type=Path, help="a folder that refine wrote, or any folder of material maps"
     )
-    parser.add_argument("--to", required=True, choices=TARGETS, help="what to write")
+    parser.add_argument("--to", required=True, choices=EXPORT_TARGETS, help="what to write")
     parser.add_argument(
         "-o",
         "--out",

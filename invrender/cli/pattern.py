@@ -83,11 +83,11 @@ def run(args: argparse.Namespace, console: Console) -> int:
     if args.optimise:
         import numpy as np
 
-        from invrender.pattern.design import CELLS, NAMES, design
+        from invrender.pattern.design import NAMES, PATTERN_CELLS, design
 
         compare: dict[str, Any] = {
-            "white": np.ones((CELLS, CELLS, 3)),
-            "default": resize_pattern(default_pattern(), CELLS),
+            "white": np.ones((PATTERN_CELLS, PATTERN_CELLS, 3)),
+            "default": resize_pattern(default_pattern(), PATTERN_CELLS),
         }
         with Progress(console=console, transient=True) as bar:
             task = bar.add_task("optimising", total=1.0)

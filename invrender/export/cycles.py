@@ -19,8 +19,8 @@ from invrender.maps import Maps
 from invrender.rig import Rig
 from invrender.types import Array
 
-ENTRIES = 32  # of the table, along the cosine to the viewer and along α
-STEPS = 24  # of the quadrature, along both random numbers
+TABLE_ENTRIES = 32  # of the table, along the cosine to the viewer and along α
+QUADRATURE_STEPS = 24  # of the quadrature, along both random numbers
 
 
 def principled(mr: MetalRough, roughness: Array, normal: Array) -> Maps:
@@ -35,7 +35,7 @@ def principled(mr: MetalRough, roughness: Array, normal: Array) -> Maps:
     cosine = np.clip((view * normal).sum(-1), 0, 1)
     alpha = roughness**2
     flat, grazing = (
-        map_coordinates(table, [cosine * (ENTRIES - 1), alpha * (ENTRIES - 1)], order=1)
+        map_coordinates(table, [cosine * (TABLE_ENTRIES - 1), alpha * (TABLE_ENTRIES - 1)], order=1)
         for table in _albedo()
     )
     m = mr.metallic[..., None]
@@ -65,9 +65,9 @@ def _albedo() -> tuple[Array, Array]:
 
     By half vectors from the visible normals; see `invrender.render.brdf.sample_vndf`.
     """
-    axis = np.linspace(0, 1, ENTRIES)
+    axis = np.linspace(0, 1, TABLE_ENTRIES)
     mu, alpha = np.maximum(axis, 1e-3)[:, None, None], np.maximum(axis, 1e-3)[None, :, None]
-    u = (np.arange(STEPS) + 0.5) / STEPS
+    u = (np.arange(QUADRATURE_STEPS) + 0.5) / QUADRATURE_STEPS
     u1, u2 = (g.ravel() for g in np.meshgrid(u, u))
     sine = np.sqrt(1 - mu**2)
     length = np.hypot(alpha * sine, mu)

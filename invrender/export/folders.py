@@ -27,7 +27,7 @@ from invrender.export.metalrough import (
     metal_rough,
     with_grey_f0,
 )
-from invrender.export.textures import SUFFIXES, Texture, write_textures
+from invrender.export.textures import FORMAT_SUFFIXES, Texture, write_textures
 from invrender.maps import Maps
 from invrender.types import Array, InputError
 
@@ -88,7 +88,7 @@ def write_blender(
     diffuse, specular = seen.values()
     script = SCRIPT.format(
         name=name,
-        suffix=SUFFIXES[format],
+        suffix=FORMAT_SUFFIXES[format],
         sides=material.sides,
         colour="Linear Rec.709" if format == "exr" else "sRGB",
         green_up=convention == "opengl",

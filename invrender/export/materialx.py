@@ -28,7 +28,7 @@ from invrender.export.metalrough import (
     maps_of,
     with_grey_f0,
 )
-from invrender.export.textures import SUFFIXES, Texture, write_textures
+from invrender.export.textures import FORMAT_SUFFIXES, Texture, write_textures
 from invrender.maps import Maps
 from invrender.types import InputError
 
@@ -91,7 +91,7 @@ def _document(mx: Any, material: Material, name: str, format: str) -> Any:
 
     def image(key: str, kind: str, colour: bool = False) -> Any:
         node = graph.addNode("image", f"image_{key}", kind)
-        file = node.setInputValue("file", f"{name}_{key}{SUFFIXES[format]}", "filename")
+        file = node.setInputValue("file", f"{name}_{key}{FORMAT_SUFFIXES[format]}", "filename")
         if colour:
             file.setColorSpace(colour_space)
         return node

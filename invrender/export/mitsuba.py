@@ -70,7 +70,7 @@ ROOM = """\
     <string name="filename" value="environment.exr"/>
     <transform name="to_world"><matrix value="0 0 -1 0  -1 0 0 0  0 1 0 0  0 0 0 1"/></transform>
   </emitter>"""
-WHITE = """\
+WHITE_SKY = """\
   <emitter type="constant"><rgb name="radiance" value="1"/></emitter>"""
 
 
@@ -109,5 +109,5 @@ def _scene(material: Material) -> str:
         diffuse=texture(10, "reflectance", "diffuse_x2"),
         alpha=texture(10, "alpha", "alpha"),
         specular=texture(10, "specular_reflectance", "specular_x2"),
-        light=WHITE if material.environment is None else ROOM,
+        light=WHITE_SKY if material.environment is None else ROOM,
     )

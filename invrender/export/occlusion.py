@@ -11,7 +11,7 @@ import numpy as np
 
 from invrender.types import Array
 
-DIRECTIONS = 8
+AZIMUTHS = 8
 GROWTH = 1.5  # between the distances at which the horizon is looked for, from one pixel on
 FARTHEST = 0.125  # of the shorter side
 
@@ -29,11 +29,11 @@ def ambient_occlusion(height: Array, pixel: float) -> Array:
     while distances[-1] * GROWTH <= reach:
         distances.append(distances[-1] * GROWTH)
     total = np.zeros_like(here)
-    for angle in 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS:
+    for angle in 2 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS:
         steepest = np.zeros_like(here)  # tangent of the horizon's elevation
         for distance in distances:
             x, y = round(distance * np.cos(angle)), round(distance * np.sin(angle))
             there = padded[reach + y : reach + y + rows, reach + x : reach + x + columns]
             np.maximum(steepest, (there - here) / np.float32(np.hypot(x, y)), out=steepest)
         total += 1 / (1 + steepest * steepest)
-    return total / DIRECTIONS
+    return total / AZIMUTHS

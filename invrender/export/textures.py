@@ -25,7 +25,7 @@ from invrender.colour import linear_to_srgb, srgb_to_linear
 from invrender.files.write import INCH, atomic_path, png_tags, write_exr
 from invrender.types import Array, InputError
 
-SUFFIXES = {"png8": ".png", "png16": ".png", "exr": ".exr", "jpeg": ".jpg"}
+FORMAT_SUFFIXES = {"png8": ".png", "png16": ".png", "exr": ".exr", "jpeg": ".jpg"}
 JPEG_QUALITY = 95
 
 
@@ -106,7 +106,7 @@ def write_textures(
 
     width: of what the textures show, metres.
     """
-    suffix = SUFFIXES[format]
+    suffix = FORMAT_SUFFIXES[format]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         jobs = {
             key: pool.submit(write_texture, folder / f"{key}{suffix}", texture, format, width)
@@ -143,7 +143,7 @@ def write_zip(folder: Path, out: Path) -> None:
     """Pack the files of a folder into a ``.zip``; images are compressed already."""
     with zipfile.ZipFile(out, "w") as archive:
         for file in sorted(folder.iterdir()):
-            image = file.suffix in SUFFIXES.values()
+            image = file.suffix in FORMAT_SUFFIXES.values()
             kind = zipfile.ZIP_STORED if image else zipfile.ZIP_DEFLATED
             archive.write(file, file.name, kind)
 

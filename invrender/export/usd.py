@@ -28,7 +28,7 @@ from invrender.export.metalrough import (
     maps_of,
     with_grey_f0,
 )
-from invrender.export.textures import SUFFIXES, Texture, write_textures
+from invrender.export.textures import FORMAT_SUFFIXES, Texture, write_textures
 from invrender.maps import Maps
 from invrender.types import InputError
 
@@ -128,7 +128,7 @@ class _Shaders:
         return shader
 
     def _file(self, key: str) -> str:
-        return f"./{self.material.name}_{key}{SUFFIXES[self.format]}"
+        return f"./{self.material.name}_{key}{FORMAT_SUFFIXES[self.format]}"
 
     def preview(self) -> Any:
         """UsdPreviewSurface."""

@@ -13,14 +13,13 @@ import numpy as np
 from PIL import Image
 
 from invrender.colour import linear_to_srgb
-from invrender.files.write import atomic_path
+from invrender.files.write import INCH, atomic_path
 from invrender.pattern.default import mirrored
 from invrender.sampling import resize_pattern
 from invrender.types import Array, InputError
 
 PAGE_PIXELS = 768  # a side of the page's image: the pattern has no finer detail
 LARGEST = 8192  # pixels a side
-INCH = 0.0254
 
 
 def device_pixels(size: float, ppi: float) -> int:

@@ -13,7 +13,7 @@ from invrender.types import Array, InputError
 
 log = logging.getLogger("invrender")
 
-SUFFIXES = (".exr", ".hdr", ".pic")
+HDR_SUFFIXES = (".exr", ".hdr", ".pic")
 
 
 def read_environment(path: Path, height: int | None = None) -> Array:
@@ -41,7 +41,7 @@ def read_environment(path: Path, height: int | None = None) -> Array:
 def find_environments(root: Path) -> list[Path]:
     """All EXR and HDR files below a folder, sorted. Raises `InputError` when there is none."""
     root = Path(root)
-    found = sorted(p for p in root.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
+    found = sorted(p for p in root.rglob("*") if p.suffix.lower() in HDR_SUFFIXES and p.is_file())
     if not found:
         raise InputError(f"{root} holds no .exr or .hdr environments")
     return found

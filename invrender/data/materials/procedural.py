@@ -17,8 +17,8 @@ from invrender.types import InputError
 
 Kind = Callable[[Canvas, np.random.Generator], Layers]
 
-MAX_SLOPE = float(np.tan(np.radians(75)))
-MIN_ROUGHNESS = 0.05
+RELIEF_LIMIT = float(np.tan(np.radians(75)))
+ROUGHNESS_FLOOR = 0.05
 
 
 def _plain(canvas: Canvas, rng: np.random.Generator) -> Layers:
@@ -119,7 +119,7 @@ def _finish(canvas: Canvas, rng: np.random.Generator, layers: Layers) -> Maps:
         base, rough, metallic, dx, dy = _wear(canvas, rng, base, rough, metallic)
         x, y = x + dx, y + dy
         steep = np.hypot(x, y)
-    limit: Array = np.tanh(steep / np.float32(MAX_SLOPE)) * np.float32(MAX_SLOPE)
+    limit: Array = np.tanh(steep / np.float32(RELIEF_LIMIT)) * np.float32(RELIEF_LIMIT)
     limit = limit / np.maximum(steep, np.float32(1e-9))
     normal: Array = np.stack([-x * limit, -y * limit, np.ones_like(x)], -1)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
@@ -132,7 +132,7 @@ def _finish(canvas: Canvas, rng: np.random.Generator, layers: Layers) -> Maps:
     return Maps(
         (np.minimum(base, 0.9) * (1 - metallic)).astype(np.float32),
         (np.float32(f0) * (1 - metallic) + base * metallic).astype(np.float32),
-        np.clip(rough, MIN_ROUGHNESS, 1).astype(np.float32),
+        np.clip(rough, ROUGHNESS_FLOOR, 1).astype(np.float32),
         normal.astype(np.float32),
     )
 

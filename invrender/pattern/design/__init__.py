@@ -1,10 +1,10 @@
 """Designing the light pattern: docs/explain/pattern.md."""
 
-from invrender.pattern.design.criterion import NAMES, WEIGHTS, Criterion
+from invrender.pattern.design.criterion import MAP_WEIGHTS, NAMES, Criterion
 from invrender.pattern.design.optimise import DARKEST, Design, design, optimise, wheel
 from invrender.pattern.design.population import (
-    CELLS,
-    GROUP,
+    GROUP_PIXELS,
+    PATTERN_CELLS,
     Population,
     Responses,
     draw_population,
@@ -12,6 +12,18 @@ from invrender.pattern.design.population import (
 )
 
 __all__ = [
-    "CELLS", "DARKEST", "GROUP", "NAMES", "WEIGHTS", "Criterion", "Design", "Population",
-    "Responses", "design", "draw_population", "measure_responses", "optimise", "wheel",
+    "DARKEST",
+    "GROUP_PIXELS",
+    "MAP_WEIGHTS",
+    "NAMES",
+    "PATTERN_CELLS",
+    "Criterion",
+    "Design",
+    "Population",
+    "Responses",
+    "design",
+    "draw_population",
+    "measure_responses",
+    "optimise",
+    "wheel",
 ]  # fmt: skip

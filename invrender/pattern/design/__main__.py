@@ -13,15 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from invrender.files.write import write_png
+from invrender.maps import NAMES
 from invrender.pattern.default import default_pattern
-from invrender.pattern.design.criterion import NAMES, Criterion
+from invrender.pattern.design.criterion import Criterion
 from invrender.pattern.design.optimise import optimise, wheel
-from invrender.pattern.design.population import CELLS, draw_population, measure_responses
+from invrender.pattern.design.population import PATTERN_CELLS, draw_population, measure_responses
 from invrender.rig import Rig
 from invrender.sampling import resize_pattern
 
-SEEDS, HELD_OUT = (1, 2), 3  # of populations
-GROUPS, ITERATIONS, PIXELS = 320, 90, 256
+SEEDS, HELD_OUT_SEED = (1, 2), 3  # of populations
+GROUPS, ITERATIONS, WRITTEN_PIXELS = 320, 90, 256
 
 
 def main() -> None:
@@ -40,10 +41,10 @@ def main() -> None:
         return float(np.mean(values)), np.mean(gradients, 0)
 
     found = optimise(mean, wheel(), ITERATIONS)
-    write_png(args.out, resize_pattern(found, PIXELS))
-    shipped = resize_pattern(default_pattern(), CELLS)
+    write_png(args.out, resize_pattern(found, WRITTEN_PIXELS))
+    shipped = resize_pattern(default_pattern(), PATTERN_CELLS)
     print(f"RMS difference from the shipped one: {np.sqrt(np.mean((found - shipped) ** 2)):.4f}")
-    held_out = criterion(HELD_OUT)
+    held_out = criterion(HELD_OUT_SEED)
     for name, pattern in (("found", found), ("shipped", shipped), ("white", np.ones_like(found))):
         errors = held_out.errors(pattern)
         maps = ", ".join(f"{m} {errors[m]:.4f}" for m in NAMES)

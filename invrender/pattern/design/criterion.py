@@ -15,16 +15,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from invrender.pattern.design.population import GROUP, Responses
+from invrender.maps import NAMES
+from invrender.pattern.design.population import GROUP_PIXELS, Responses
 from invrender.types import Array
 
-NAMES = ("normal", "diffuse", "roughness", "specular")
-WEIGHTS = (1 / 3, 1 / 6, 1 / 3, 1 / 6)  # of the maps, in that order
+MAP_WEIGHTS = (1 / 3, 1 / 6, 1 / 3, 1 / 6)  # of the maps, in that order
 SLOPE_SD, DIFFUSE_SD, ROUGHNESS_SD = 0.2, 0.2, 0.25  # priors
 SPECULAR_SD, METAL_DIFFUSE_SD, METAL_SPECULAR_SD = 0.03, 0.05, 0.2
 ALBEDO_SD = 0.07  # grey variation from pixel to pixel of one material, relative
 GAIN_SD, ROOM_SD = 0.03, 0.1  # of the screen's white (RGB) and of the environment, relative
-NOISE, FLOOR = 0.01, 0.003  # sensor and model: of the value, and of the photo's mean
+SENSOR_NOISE, MODEL_NOISE = 0.01, 0.003  # sensor and model: of the value, and of the photo's mean
 
 # Unknowns of a group: k_d (3), k_s (3), ρ, gain (3), room; then for each pixel s, t, albedo.
 SHARED, EACH = 11, 3
@@ -38,14 +38,14 @@ class Criterion:
         self.cells = r.cells
         self.k_d, self.k_s = p.diffuse.astype(np.float64), p.specular.astype(np.float64)
         m = len(p.x)
-        self.groups = m // GROUP
+        self.groups = m // GROUP_PIXELS
         self.screen = r.screen.reshape(m * 12, -1)
         self.room = r.room.astype(np.float64)
         self.prior = _prior_precision(p.metal)
         # Which unknowns count for which map, with what weight: the map's mean square error.
-        n = SHARED + EACH * GROUP
+        n = SHARED + EACH * GROUP_PIXELS
         self.maps = np.zeros((4, n))
-        self.maps[0, SHARED::EACH] = self.maps[0, SHARED + 1 :: EACH] = 1 / (12 * GROUP)
+        self.maps[0, SHARED::EACH] = self.maps[0, SHARED + 1 :: EACH] = 1 / (12 * GROUP_PIXELS)
         self.maps[1, 0:3] = self.maps[3, 3:6] = 1 / 3
         self.maps[2, 6] = 1
         prior = np.linalg.inv(self.prior)
@@ -55,7 +55,7 @@ class Criterion:
         return np.einsum("gii,mi->m", covariance, self.maps) / self.groups
 
     def _forward(self, pattern: Array) -> tuple[Array, ...]:
-        """Radiance of screen and room (M, 3) and the Jacobian (groups, 3·GROUP, unknowns)."""
+        """Radiance of screen and room (M, 3) and the Jacobian (groups, 3·pixels, unknowns)."""
         flat = pattern.reshape(-1, 3).astype(np.float32)
         lit = (self.screen @ flat).reshape(-1, 4, 3, 3).astype(np.float64)
         total = lit + self.room
@@ -66,8 +66,8 @@ class Criterion:
 
     def _jacobian(self, total: Array, rows: Array, screen: Array) -> Array:
         g = self.groups
-        j = np.zeros((g, GROUP, 3, SHARED + EACH * GROUP))
-        shape = (g, GROUP, 3)
+        j = np.zeros((g, GROUP_PIXELS, 3, SHARED + EACH * GROUP_PIXELS))
+        shape = (g, GROUP_PIXELS, 3)
         e, b = total[:, 0, 0].reshape(shape), total[:, 0, 1].reshape(shape)
         value = rows[:, 0].reshape(shape)
         lit = screen.reshape(shape)
@@ -77,19 +77,19 @@ class Criterion:
             j[:, :, c, 7 + c] = lit[..., c]
         j[..., 6] = rows[:, 1].reshape(shape)
         j[..., 10] = value - lit
-        for i in range(GROUP):
+        for i in range(GROUP_PIXELS):
             k = SHARED + EACH * i
             j[:, i, :, k] = rows[:, 2].reshape(shape)[:, i]
             j[:, i, :, k + 1] = rows[:, 3].reshape(shape)[:, i]
             j[:, i, :, k + 2] = value[:, i]
-        return j.reshape(g, GROUP * 3, -1)
+        return j.reshape(g, GROUP_PIXELS * 3, -1)
 
     def errors(self, pattern: Array) -> dict[str, float]:
         """Root-mean-square posterior sd of each map, and the criterion."""
         covariance = self._solve(pattern)[0]
         sd = np.sqrt(self._mse(covariance))
         out = dict(zip(NAMES, sd.tolist(), strict=True))
-        out["criterion"] = float(np.dot(WEIGHTS, sd / np.sqrt(self.prior_mse)))
+        out["criterion"] = float(np.dot(MAP_WEIGHTS, sd / np.sqrt(self.prior_mse)))
         return out
 
     def _solve(self, pattern: Array) -> tuple[Array, ...]:
@@ -97,7 +97,7 @@ class Criterion:
         j = self._jacobian(total, rows, screen)
         value = rows[:, 0].reshape(self.groups, -1)
         mean = value.mean()
-        noise = (NOISE * value) ** 2 + (FLOOR * mean) ** 2
+        noise = (SENSOR_NOISE * value) ** 2 + (MODEL_NOISE * mean) ** 2
         jn = j / noise[..., None]
         precision = self.prior + np.swapaxes(j, 1, 2) @ jn
         return np.linalg.inv(precision), j, jn, noise, value, mean, total, weights
@@ -107,7 +107,7 @@ class Criterion:
         covariance, j, _, noise, value, mean, total, weights = self._solve(pattern)
         mse = self._mse(covariance)
         sd = np.sqrt(mse)
-        scale = np.asarray(WEIGHTS) / np.sqrt(self.prior_mse)
+        scale = np.asarray(MAP_WEIGHTS) / np.sqrt(self.prior_mse)
         loss = float(scale @ sd)
         # d mse_m = -tr(C diag(maps_m) C dH) / groups
         d = (scale / (2 * sd) / self.groups) @ self.maps
@@ -115,19 +115,19 @@ class Criterion:
         jg = j @ g
         d_j = 2 * jg / noise[..., None]
         d_noise = -np.einsum("gij,gij->gi", jg, j) / noise**2
-        d_value = d_noise * 2 * NOISE**2 * value
-        d_value += (d_noise.sum() * 2 * FLOOR**2 * mean) / value.size
+        d_value = d_noise * 2 * SENSOR_NOISE**2 * value
+        d_value += (d_noise.sum() * 2 * MODEL_NOISE**2 * mean) / value.size
         return loss, self._to_pattern(d_j, d_value, total, weights)
 
     def _to_pattern(self, d_j: Array, d_value: Array, total: Array, weights: Array) -> Array:
         """Back through `_jacobian` and `_forward`."""
         g = self.groups
-        d_j = d_j.reshape(g, GROUP, 3, -1)
-        shape = (g * GROUP, 3)
+        d_j = d_j.reshape(g, GROUP_PIXELS, 3, -1)
+        shape = (g * GROUP_PIXELS, 3)
         own = lambda k: np.stack(  # noqa: E731
-            [d_j[:, i, :, SHARED + EACH * i + k] for i in range(GROUP)], 1
+            [d_j[:, i, :, SHARED + EACH * i + k] for i in range(GROUP_PIXELS)], 1
         ).reshape(shape)
-        d_rows = np.zeros((g * GROUP, 4, 3))
+        d_rows = np.zeros((g * GROUP_PIXELS, 4, 3))
         d_rows[:, 0] = d_value.reshape(shape) + own(2) + d_j[..., 10].reshape(shape)
         d_rows[:, 1] = d_j[..., 6].reshape(shape)
         d_rows[:, 2], d_rows[:, 3] = own(0), own(1)
@@ -145,7 +145,7 @@ class Criterion:
 
 def _prior_precision(metal: NDArray[np.bool_]) -> Array:
     """(groups, unknowns, unknowns)."""
-    n = SHARED + EACH * GROUP
+    n = SHARED + EACH * GROUP_PIXELS
     out = np.zeros((len(metal), n, n))
     same = np.eye(3)
 

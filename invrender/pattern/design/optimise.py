@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 
 from invrender.pattern.default import default_pattern
 from invrender.pattern.design.criterion import Criterion
-from invrender.pattern.design.population import CELLS, draw_population, measure_responses
+from invrender.pattern.design.population import PATTERN_CELLS, draw_population, measure_responses
 from invrender.rig import Rig
 from invrender.sampling import resize_pattern
 from invrender.types import Array
@@ -72,7 +72,7 @@ def _roughness(pattern: Array) -> tuple[float, Array]:
     return total, gradient
 
 
-def wheel(cells: int = CELLS, angle: float = 0.0, flip: bool = False) -> Array:
+def wheel(cells: int = PATTERN_CELLS, angle: float = 0.0, flip: bool = False) -> Array:
     """Hue by direction from the screen's centre, (cells, cells, 3): where searches start.
 
     No two directions of a normal look alike in it. The criterion, a local bound, does not ask for
@@ -102,7 +102,7 @@ def design(
     iterations: int = 80,
     samples: int = 128,
     seed: int = 0,
-    cells: int = CELLS,
+    cells: int = PATTERN_CELLS,
     rooms: int = 12,
     progress: Callable[[float], None] | None = None,
 ) -> Design:

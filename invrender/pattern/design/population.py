@@ -22,14 +22,14 @@ from invrender.rig import Rig
 from invrender.sphere import scale_environment
 from invrender.types import Array
 
-CELLS = 16  # of the pattern a side, bilinear between: about what the ball's image resolves
-GROUP = 8  # pixels that share a material
+PATTERN_CELLS = 16  # of the pattern a side, bilinear between: about what the ball's image resolves
+GROUP_PIXELS = 8  # pixels that share a material
 ROOM_HEIGHT = 64  # rows of the environments
 
 
 @dataclass
 class Population:
-    """Pixels in groups of `GROUP` that share a material and a room; M = groups · GROUP.
+    """Pixels in groups of `GROUP_PIXELS` that share a material and a room; M in all.
 
     x (M, 3) metres, normal (M, 3), roughness, diffuse, specular (M, ·): as each pixel has them.
     metal (groups,): whether the material is one. env_index, env_level (groups,): the room's number
@@ -66,16 +66,16 @@ def draw_population(rig: Rig, groups: int, seed: int, rooms: int = 12) -> Popula
     # Where a material's pixels are: from next to each other to all over the sample.
     spread = np.exp(rng.uniform(np.log(0.03), np.log(1), (groups, 1, 1))) * half
     centre = rng.uniform(-half, half, (groups, 1, 2))
-    xy = centre + spread * rng.standard_normal((groups, GROUP, 2))
+    xy = centre + spread * rng.standard_normal((groups, GROUP_PIXELS, 2))
     xy = half - np.abs((xy + half) % (4 * half) - 2 * half)  # reflected at the border
     relief = np.exp(rng.uniform(np.log(0.03), np.log(0.4), (groups, 1, 1)))
-    slope = relief * rng.standard_normal((groups, GROUP, 2))
+    slope = relief * rng.standard_normal((groups, GROUP_PIXELS, 2))
     slope /= np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1)  # up to 45°
-    normal = np.concatenate([slope, np.ones((groups, GROUP, 1))], -1).reshape(-1, 3)
+    normal = np.concatenate([slope, np.ones((groups, GROUP_PIXELS, 1))], -1).reshape(-1, 3)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    each = lambda v: np.repeat(v, GROUP, axis=0)  # noqa: E731
+    each = lambda v: np.repeat(v, GROUP_PIXELS, axis=0)  # noqa: E731
     return Population(
-        np.concatenate([xy, np.zeros((groups, GROUP, 1))], -1).reshape(-1, 3),
+        np.concatenate([xy, np.zeros((groups, GROUP_PIXELS, 1))], -1).reshape(-1, 3),
         normal,
         each(rho),
         each(k_d),
@@ -103,7 +103,7 @@ class Responses:
 def measure_responses(
     rig: Rig,
     population: Population,
-    cells: int = CELLS,
+    cells: int = PATTERN_CELLS,
     samples: int = 192,
     progress: Callable[[float], None] | None = None,
 ) -> Responses:
@@ -125,7 +125,7 @@ def measure_responses(
     white = _screen_irradiance(screen, population)
     room = np.zeros((m, 4, 3, 3), np.float32)
     black = np.zeros((cells, cells, 3))  # it still hides what is behind it
-    group = np.repeat(np.arange(len(population.env_index)), GROUP)
+    group = np.repeat(np.arange(len(population.env_index)), GROUP_PIXELS)
     for index in np.unique(population.env_index):
         env = scale_environment(procedural_environment(int(index), ROOM_HEIGHT), 1.0)
         pixels = np.flatnonzero(population.env_index[group] == index)

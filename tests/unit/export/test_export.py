@@ -12,6 +12,7 @@ import OpenEXR
 import pytest
 from PIL import Image
 
+from invrender.cli import export as cli
 from invrender.cli.main import main
 from invrender.colour import srgb_to_linear
 from invrender.data.materials import procedural_material, read_material
@@ -269,6 +270,7 @@ def test_names_from_files_stay_in_the_folder(maps, tmp_path):
 
 
 def test_command(maps, tmp_path, capsys):
+    assert tuple(TARGETS) == cli.EXPORT_TARGETS
     source = tmp_path / "source"
     source.mkdir()
     write_maps(source, maps)

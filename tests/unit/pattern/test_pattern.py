@@ -19,7 +19,7 @@ from invrender.files.rig_toml import write_rig
 from invrender.pattern.default import block_pattern, default_pattern, mirrored
 from invrender.pattern.design import (
     DARKEST,
-    GROUP,
+    GROUP_PIXELS,
     NAMES,
     Criterion,
     design,
@@ -171,7 +171,7 @@ def test_population_is_seeded_and_in_range():
     a, b = draw_population(RIG, 50, 3), draw_population(RIG, 50, 3)
     assert np.array_equal(a.x, b.x) and np.array_equal(a.specular, b.specular)
     assert not np.array_equal(a.x, draw_population(RIG, 50, 4).x)
-    assert len(a.x) == 50 * GROUP
+    assert len(a.x) == 50 * GROUP_PIXELS
     assert np.abs(a.x[:, :2]).max() <= RIG.sample_size / 2 and np.all(a.x[:, 2] == 0)
     assert a.normal[:, 2].min() > 0.7 and np.allclose(np.linalg.norm(a.normal, axis=1), 1)
     assert np.all((a.specular > 0) & (a.specular < 1) & (a.diffuse >= 0) & (a.diffuse <= 0.9))
