@@ -81,6 +81,7 @@ def measure(shot: Shot, kind: str) -> dict[str, Any]:
         return row
     room = resample_environment(shot.environment, len(lights.environment))
     room[len(room) // 2 :] = 0
+    assert lights.coverage is not None
     seen = (lights.coverage > 0.5)[..., None]
     for name, part in (("irradiance", 1), ("irradiance seen", seen)):
         e, t = (

@@ -19,6 +19,7 @@ from benchmarks.common.plot import plot_error_over_time
 from benchmarks.common.results import bar, benchmark_parser, table, write_results
 from benchmarks.common.timing import timed
 from invrender.data.environments import procedural_environment
+from invrender.lights import Lights
 from invrender.pattern.default import default_pattern
 from invrender.rig import Rig
 from nets.model import MAPS
@@ -36,7 +37,7 @@ def seconds(network: Reconstructor, repeats: int) -> float:
     """Median time of a sample's maps, one sample done before."""
     photo = np.random.default_rng(0).uniform(0, 1, (SIZE, SIZE, 3)).astype(np.float32)
     pattern, room = default_pattern(128), procedural_environment(0, 64)
-    return timed(lambda: network(photo, Rig(), pattern, np.ones(3), room), repeats)[1]
+    return timed(lambda: network(photo, Lights(Rig(), pattern, room)), repeats)[1]
 
 
 def millions(network: torch.nn.Module) -> float:

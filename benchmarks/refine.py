@@ -23,14 +23,17 @@ import numpy as np
 from benchmarks.common.captures import OTHERS, PHOTOGRAPHS, arguments, make_captures, true_lights
 from benchmarks.common.plot import plot_error_over_time
 from benchmarks.common.results import Bar, Table, bar, table, write_results
-from invrender.capture.crop import crop_mask, crop_sample
+from invrender.capture.lights import find_lights
 from invrender.data import EXAMPLE
+from invrender.files.capture import load_capture
 from invrender.maps import NAMES, Maps, constant_maps, map_errors, resize_maps
-from invrender.pipeline import POOR_FIT, Seen, Stages, recover, see
+from invrender.metrics import calibration
+from invrender.pipeline import Sample, Stages, estimate_maps
 from invrender.refine.checks import coarse_error, photo_error
+from invrender.refine.theta import deviations
 from invrender.render.point_lights import rerender
 from invrender.render.renderer import Renderer
-from invrender.report.results import deviations
+from invrender.report.notices import POOR_FIT
 from invrender.types import Array
 
 TRUE = "network, true lights"
@@ -48,17 +51,6 @@ Row = dict[str, Any]
 def rerender_error(maps: Maps, truth: Maps) -> float:
     """RMSE under nine point lights, as displayed."""
     return float(np.sqrt(np.mean((rerender(maps) - rerender(truth)) ** 2, dtype=np.float64)))
-
-
-def coverage(maps: Maps, truth: Maps, sigma: dict[str, Any]) -> dict[str, float]:
-    """Share of the truth within one standard deviation; of normals x and y, encoded."""
-    found, true = maps.encoded(), truth.encoded()
-    shares = {}
-    for name, s in sigma.items():
-        a, b = (x[name][..., :2] if name == "normal" else x[name] for x in (found, true))
-        s = s[..., None] if a.ndim > s.ndim else s
-        shares[name] = float((np.abs(a - b) <= s).mean())
-    return shares
 
 
 def pattern_in_albedo(maps: Maps, truth: Maps, renderer: Renderer) -> tuple[float, float] | None:
@@ -100,29 +92,26 @@ def is_flat(truth: Maps) -> bool:
     return all(float(maps[n].std((0, 1)).max()) <= most for n, most in FLAT.items())
 
 
-def relit(folder: Path, size: int, seen: Seen) -> Seen:
-    """The capture with its true lights, and the crop of the true rig."""
-    photo, lights = seen.capture.photo, true_lights(folder, seen.capture)
-    crop = crop_sample(photo, lights.rig, size)
-    return replace(seen, lights=lights, photo=crop, clipped=crop_mask(photo, lights.rig, size))
-
-
 def measure(folder: Path, size: int, init: str, noise: float | None = None) -> Row:
     """Refine a capture and compare with its truth; noise: of the sensor, where it is known."""
     stage = Stages()
     cpu = time.process_time()
-    seen = see(folder, size, stage)
+    with stage("read"):
+        capture = load_capture(folder)
+    with stage("lights"):
+        found = find_lights(capture)
     if init == TRUE:
-        seen, init = relit(folder, size, seen), "network"
-    start, result, shots = recover([seen], stage, init=init)
+        found, init = replace(found, lights=true_lights(folder, found.capture)), "network"
+    sample = Sample.of(found, size)
+    start, result, (shot,) = estimate_maps([sample], stage, init)
     cpu = time.process_time() - cpu
-    assert seen.capture.truth is not None
-    truth, renderer = resize_maps(seen.capture.truth, size, size), shots[0].renderer
+    assert capture.truth is not None
+    truth, renderer = resize_maps(capture.truth, size, size), shot.renderer
     done = sum(stage.seconds.values())
-    shares = coverage(result.maps, truth, deviations(result.sigma))
+    shares = calibration(result.maps, truth, deviations(result.sigma))
     row: Row = {
         "capture": folder.name,
-        "jpeg": seen.capture.photo.clip_level is not None,
+        "jpeg": capture.photo.clip_level is not None,
         "seconds_initial": done - stage.seconds["refine"] - stage.seconds.get("materials", 0.0),
         "seconds_refined": done,
         "processor_seconds": cpu,
@@ -134,15 +123,15 @@ def measure(folder: Path, size: int, init: str, noise: float | None = None) -> R
     }
     for when, maps in zip(WHEN, (start, result.maps), strict=True):
         shown = renderer.render(maps, SAMPLES)
-        row[f"photo_{when}"] = photo_error(shown, seen.photo, seen.clipped)
+        row[f"photo_{when}"] = photo_error(shown, sample.photo, sample.clipped)
         for name, error in map_errors(maps, truth).items():
             row[f"{name}_{when}"] = error
         row[f"rerender_{when}"] = rerender_error(maps, truth)
-    row["coarse"] = coarse_error(shown, seen.photo, seen.clipped)
+    row["coarse"] = coarse_error(shown, sample.photo, sample.clipped)
     row["warned"] = row["coarse"] > POOR_FIT[init]
     if noise is not None and not row["jpeg"] and is_flat(truth):
-        level = float(np.percentile(seen.capture.photo.image, 99))
-        row["photo_over_noise"] = row["photo_refined"] / expected_noise(seen.photo, level, noise)
+        level = float(np.percentile(capture.photo.image, 99))
+        row["photo_over_noise"] = row["photo_refined"] / expected_noise(sample.photo, level, noise)
     return row
 
 

@@ -29,10 +29,13 @@ from benchmarks.common.gradients import sample_sensor
 from benchmarks.common.plot import plot_error_over_time
 from benchmarks.common.results import Table, bar, table, write_results
 from benchmarks.common.torch_forward import TorchScene
+from invrender.capture.lights import find_lights
+from invrender.files.capture import load_capture
+from invrender.lights import Lights
 from invrender.maps import Maps, map_errors, resize_maps
-from invrender.pipeline import Seen, Stages, see
+from invrender.pipeline import Sample
 from invrender.refine.cautious import SHARE, correct
-from invrender.refine.gauss_newton import PHOTO_NOISE, Shot, linearise, refine
+from invrender.refine.gauss_newton import PHOTO_NOISE, linearise, refine
 from invrender.refine.priors import Prior, network_prior
 from invrender.refine.theta import project, to_maps, to_theta
 from invrender.render import brdf  # noqa: F401  (Dr.Jit's back end before Mitsuba)
@@ -55,24 +58,21 @@ class Problem:
     """A capture at n × n with its prior; θ = θ₀ + σ·z, the data term by some renderer."""
 
     def __init__(self, folder: Path, n: int) -> None:
-        self.seen: Seen = see(folder, n, Stages())
-        assert self.seen.capture.truth is not None
-        self.n, self.photo = n, self.seen.photo
-        self.truth: Maps = resize_maps(self.seen.capture.truth, n, n)
-        clipped = self.seen.clipped if self.seen.clipped.any() else None
-        self.shot = Shot(self.photo, self.seen.renderer(), clipped)
-        lights = self.seen.lights
+        found = find_lights(load_capture(folder))
+        assert found.capture.truth is not None
+        self.lights: Lights = found.lights
+        self.shot = Sample.of(found, n).shot()
+        self.n, self.photo = n, self.shot.photo
+        self.truth: Maps = resize_maps(found.capture.truth, n, n)
         self.network = Reconstructor()
-        self.estimate = self.network(
-            self.photo, lights.rig, lights.pattern, lights.gain, lights.environment,
-            lights.pattern_captured,
-        )  # fmt: skip
+        self.estimate = self.network(self.photo, self.lights)
         full = network_prior(self.estimate.maps, self.estimate.sigma)
         cautious = (full.sigma * np.maximum(SHARE, LEAST)).astype(np.float32)
         self.prior = Prior(full.mean, cautious, full.correlation)
         mean = float(self.photo.mean())
         self.noise = (PHOTO_NOISE[0] * self.photo) ** 2 + (PHOTO_NOISE[1] * mean) ** 2
-        self.noise = np.where(self.seen.clipped[..., None], 1e12 * mean**2, self.noise)
+        if self.shot.clipped is not None:
+            self.noise = np.where(self.shot.clipped[..., None], 1e12 * mean**2, self.noise)
         self.noise = self.noise.astype(np.float32)
         self.precision = np.linalg.inv(self.prior.correlation)
 
@@ -107,7 +107,7 @@ def ours(problem: Problem) -> Gradient:
 
 def prb(problem: Problem) -> Gradient:
     """Value and gradient by Mitsuba: one render for the adjoint, another for the gradient."""
-    lights, n = problem.seen.lights, problem.n
+    lights, n = problem.lights, problem.n
     scene = sample_scene(
         lights.rig, to_maps(problem.prior.mean), lights.pattern, lights.environment, lights.gain
     )
@@ -143,7 +143,7 @@ def prb(problem: Problem) -> Gradient:
 
 def autograd(problem: Problem) -> Gradient:
     """Value and gradient by PyTorch through the integral in plain tensor operations."""
-    lights = problem.seen.lights
+    lights = problem.lights
     pattern = (lights.pattern * lights.gain).astype(np.float32)
     scene = TorchScene(lights.rig, problem.truth, pattern, lights.environment, 1.0)
     photo, noise = (torch.as_tensor(x).reshape(-1, 3) for x in (problem.photo, problem.noise))
@@ -234,7 +234,7 @@ def chain(problem: Problem) -> Curve:
     curve = [point(problem, np.zeros_like(problem.prior.mean), 0.0)]
     for _ in range(2):  # the first compiles
         began = time.process_time()
-        e = improve(problem.photo, problem.shot.renderer, problem.estimate, problem.seen.clipped)
+        e = improve(problem.photo, problem.shot.renderer, problem.estimate, problem.shot.clipped)
         prior = network_prior(e.maps, e.sigma)
         times = [time.process_time() - began]
         result = correct([problem.shot], prior)
@@ -246,7 +246,7 @@ def chain(problem: Problem) -> Curve:
 
 def adapt(problem: Problem, rate: float, seconds: float, limit: int) -> tuple[float, Curve]:
     """Adam on the network's weights, for what its maps leave of the photo: the least, the curve."""
-    lights = problem.seen.lights
+    lights = problem.lights
     inputs = light_inputs(
         lights.rig, lights.pattern, lights.gain, lights.environment, lights.pattern_captured
     )

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from benchmarks.common.captures import CaptureSet, arguments, make_captures
 from benchmarks.common.results import table, write_results
+from invrender.capture.lights import find_lights
+from invrender.files.capture import load_capture
 from invrender.maps import NAMES, resize_maps
-from invrender.pipeline import Stages, recover, see
-from invrender.report.results import deviations
+from invrender.pipeline import reconstruct
 
 REAL = CaptureSet("train", 97_000, every=4)  # a few show all families
 MADE = CaptureSet("train", 98_000)
@@ -30,12 +31,12 @@ STEP = 4  # every how many pixels count: errors are shared by neighbours
 
 def ratios(folder: Path, size: int) -> dict[str, NDArray[np.floating[Any]]]:
     """|error|/sigma of some pixels of each map; of normals x and y, encoded."""
-    seen = see(folder, size, Stages())
-    _, result, _ = recover([seen], Stages())
-    assert seen.capture.truth is not None
-    found, true = result.maps.encoded(), resize_maps(seen.capture.truth, size, size).encoded()
+    capture = load_capture(folder)
+    result = reconstruct(find_lights(capture), size=size)
+    assert capture.truth is not None
+    found, true = result.maps.encoded(), resize_maps(capture.truth, size, size).encoded()
     out: dict[str, NDArray[np.floating[Any]]] = {}
-    for name, sigma in deviations(result.sigma).items():
+    for name, sigma in result.estimate.sigma.items():
         error = np.abs(found[name] - true[name])
         error = error[..., :2] if name == "normal" else error
         sigma = sigma[..., None] if error.ndim > sigma.ndim else sigma

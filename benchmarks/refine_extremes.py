@@ -2,7 +2,7 @@
 
 Photos are rendered by the forward model from known maps and refined from a flat start and from the
 networks' maps, with the true lights unless the case says otherwise. A run warns where the photo's
-large shades are not explained to within `invrender.pipeline.POOR_FIT`, or where the albedo's
+large shades are not explained to within `invrender.report.notices.POOR_FIT`, or where the albedo's
 colours follow the light's (`BAKED`).
 """
 
@@ -17,16 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.common.results import Bar, bar, benchmark_parser, table, write_results
-from invrender.capture.lights import known_lights
 from invrender.data.environments import procedural_environment
-from invrender.files.capture import Capture
-from invrender.files.images import Photo
+from invrender.lights import Lights
 from invrender.maps import Maps, constant_maps, map_errors
 from invrender.pattern.default import default_pattern
-from invrender.pipeline import BAKED, POOR_FIT, Seen, Stages, recover
+from invrender.pipeline import Sample, Stages, estimate_maps
 from invrender.refine.checks import baked_light, coarse_error, photo_error
 from invrender.render import Fast
 from invrender.render.scene import make_scene
+from invrender.report.notices import BAKED, POOR_FIT
 from invrender.rig import Rig
 from invrender.sphere import scale_environment
 
@@ -98,11 +97,10 @@ def run(case: Case, seed: int, init: str) -> dict[str, Any]:
     photo, clipped = photograph(case, seed)
     mask = np.zeros(photo.shape[:2], bool) if clipped is None else clipped
     room = np.zeros((64, 128, 3), np.float32) if case.environment is None else case.environment
-    capture = Capture(Photo(photo), RIG, PATTERN)
-    seen = Seen(capture, None, known_lights(capture, room, GAIN), photo, mask)
     stage = Stages()
-    start, result, shots = recover([seen], stage, init=init)
-    renderer = shots[0].renderer
+    sample = Sample(photo, mask, Lights(RIG, PATTERN, room, GAIN))
+    start, result, (shot,) = estimate_maps([sample], stage, init)
+    renderer = shot.renderer
     images = [*result.maps.encoded().values(), result.sigma]
     before, after = map_errors(start, case.maps), map_errors(result.maps, case.maps)
     baked = baked_light(result.maps.diffuse, renderer)

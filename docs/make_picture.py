@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from invrender.cli.main import EXAMPLE
 from invrender.colour import linear_to_srgb
+from invrender.data import EXAMPLE
 from invrender.data.environments import procedural_environment, scale_environment
 from invrender.export import export
 from invrender.files.capture import load_capture

@@ -34,7 +34,7 @@ def main(argv: list[str] | None = None) -> None:
     report = refine_capture(args.capture, args.out, size=args.size, init=args.init)
     print(f"photo error {report.photo_error['initial']:.3f} → {report.photo_error['refined']:.3f}")
     for warning in report.warnings:
-        print("warning:", warning)
+        print("warning:", warning.text)
 
     # 2. The maps are plain arrays, row 0 at +y; so is the expected error of each.
     maps = read_maps(args.out)

@@ -122,6 +122,18 @@ class Maps:
         }
 
 
+@dataclass(frozen=True)
+class Estimate:
+    """Maps, and how sure they are.
+
+    sigma: for each map, by its name, the standard deviation that its error is expected to have, as
+    the map is encoded (normals as n/2 + 1/2): (H, W), or (H, W, 3) for each channel of an albedo.
+    """
+
+    maps: Maps
+    sigma: dict[str, Array]
+
+
 def constant_maps(
     height: int,
     width: int,

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from invrender.colour import linear_to_srgb
-from invrender.maps import Maps, map_errors
+from invrender.maps import Estimate, Maps, map_errors, resize_maps
 from invrender.rig import Rig
 from invrender.sampling import resize
 from invrender.types import Array, InputError
@@ -63,6 +63,39 @@ def map_metrics(maps: Maps, truth: Maps, rig: Rig | None = None) -> dict[str, Me
     rmse = float(np.sqrt(np.mean((images[0].astype(np.float64) - images[1]) ** 2)))
     rerendered: Metrics = {"rmse": rmse, "psnr": psnr(*images), **means}
     return {"maps": {**map_errors(maps, truth)}, "rerender": rerendered}
+
+
+def evaluate(
+    estimate: Estimate | Maps, truth: Maps, rig: Rig | None = None
+) -> dict[str, dict[str, float | None]]:
+    """How far maps are from the truth, which is resized to them.
+
+    ``maps``: the RMSE of each, albedos and roughness linear, normals encoded, and their
+    ``average``. ``rerender``: what nine point lights show of it (`map_metrics`). ``calibration``,
+    where ``estimate`` says how sure it is: the share of each map's values that are within one
+    standard deviation of the truth, 0.68 if the deviations are right; of normals x and y count.
+    rig: whose camera and screen place the point lights.
+
+        found = invrender.evaluate(result.estimate, capture.truth)
+        print(found["maps"]["average"], found["calibration"]["roughness"])
+    """
+    maps = estimate if isinstance(estimate, Maps) else estimate.maps
+    truth = resize_maps(truth, *maps.shape)
+    found = map_metrics(maps, truth, rig)
+    if isinstance(estimate, Estimate):
+        found["calibration"] = {**calibration(maps, truth, estimate.sigma)}
+    return found
+
+
+def calibration(maps: Maps, truth: Maps, sigma: dict[str, Array]) -> dict[str, float]:
+    """Share of each map's values within one standard deviation of the truth's."""
+    found, true = maps.encoded(), truth.encoded()
+    shares = {}
+    for name, deviation in sigma.items():
+        a, b = (x[name][..., :2] if name == "normal" else x[name] for x in (found, true))
+        deviation = deviation[..., None] if a.ndim > deviation.ndim else deviation
+        shares[name] = float((np.abs(a - b) <= deviation).mean())
+    return shares
 
 
 def psnr(image: Array, reference: Array) -> float | None:

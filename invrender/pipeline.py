@@ -1,4 +1,4 @@
-"""The main job: a capture folder in, material maps and a report out."""
+"""The main job: load a capture, find its lights, estimate its maps, refine them, save."""
 
 from __future__ import annotations
 
@@ -12,55 +12,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from invrender.capture.crop import crop_mask, crop_sample
-from invrender.capture.lights import Lights, find_lights
-from invrender.capture.mirror import Ball
-from invrender.files.capture import Capture, load_capture
-from invrender.maps import Maps, map_errors, resize_maps, turn_maps
-from invrender.refine.checks import coarse_error, photo_error
-from invrender.report.page import Report
-from invrender.report.results import write_results
-from invrender.types import Array, InputError, Notice
+from invrender.capture.lights import FoundLights, find_lights
+from invrender.files.capture import load_capture
+from invrender.files.output import check_output
+from invrender.lights import Lights
+from invrender.maps import Estimate, Maps, map_errors, resize_maps, turn_maps
+from invrender.report.notices import map_notices
+from invrender.report.report import Report
+from invrender.report.result import SAMPLES, Result
+from invrender.types import Array, InputError, Mask
 
-if TYPE_CHECKING:
-    from invrender.refine.gauss_newton import Refined
+if TYPE_CHECKING:  # Dr.Jit compiles where the refinement is imported
+    from invrender.refine.gauss_newton import Refined, Shot
 
-FINAL_SAMPLES = 256
-FAR_OFF = 0.1  # of its size that the screen may hang off before the rig is in doubt
-# `coarse_error` from which the maps are in doubt; from a flat start each pixel's albedo explains
-# more.
-POOR_FIT = {"network": 0.25, "flat": 0.1}
-BAKED = 0.6  # correlation of albedo and light, negative, from which the lights are in doubt
-
-
-@dataclass(frozen=True)
-class Seen:
-    """What a capture tells before its maps: the lights, and the sample as its photo shows it.
-
-    photo: (size, size, 3), linear radiance; clipped: (size, size), where it is saturated. ball:
-    None where the lights were known without one. notices: what a person should know of them.
-    """
-
-    capture: Capture
-    ball: Ball | None
-    lights: Lights
-    photo: Array
-    clipped: NDArray[np.bool_]
-    notices: Sequence[Notice] = ()
-
-    def renderer(self, turn: int = 0) -> Any:
-        """The forward model of these lights, turned by quarters about the sample's normal."""
-        from invrender.refine.several import turned_environment, turned_rig
-        from invrender.render.fast.estimator import Fast
-        from invrender.render.scene import make_scene
-
-        rig, room = self.lights.rig, self.lights.environment
-        if turn % 4:
-            rig, room = turned_rig(rig, turn), turned_environment(room, turn)
-        dark = not room.any()
-        return Fast(make_scene(rig, self.lights.pattern, None if dark else room, self.lights.gain))
+MEGABYTES = 200e-6, 8  # of a result: a pixel, and for the rest
 
 
 class Stages:
@@ -77,126 +44,42 @@ class Stages:
         yield
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
 
-
-def see(
-    folder: Path,
-    size: int,
-    stage: Stages,
-    *,
-    ball: tuple[float, float, float] | None = None,
-    environment: Array | None = None,
-    gain: Any = None,
-) -> Seen:
-    """Read a capture, find its lights and cut out its sample, ``size`` pixels a side.
-
-    environment: the room's radiance (H, 2H, 3) in the photo's unit, if it is known; noughts for a
-    dark room. gain: of the screen, likewise. With both, no ball is looked for.
-    """
-    with stage("read"):
-        capture = load_capture(folder)
-    with stage("lights"):
-        found = find_lights(capture, ball=ball, environment=environment, gain=gain)
-    with stage("crop"):
-        photo = crop_sample(found.capture.photo, found.lights.rig, size)
-        clipped = crop_mask(found.capture.photo, found.lights.rig, size)
-    return Seen(found.capture, found.ball, found.lights, photo, clipped, found.notices)
+    def part(self, name: str) -> Callable[[float], None]:
+        """What tells ``progress`` the share done of a stage."""
+        return lambda share: self.progress(f"{name}: {share:.0%}")
 
 
-def recover(
-    seen: Sequence[Seen],
-    stage: Stages,
-    *,
-    init: str = "network",
-    samples: int = 64,
-    keep: Path | None = None,
-) -> tuple[Maps, Refined, list[Any]]:
-    """Initial and refined maps of one sample from one or more photos, and the photos' lights.
+@dataclass(frozen=True)
+class Sample:
+    """A sample as a photo shows it: photo (N, N, 3), linear radiance; clipped (N, N), where it is
+    saturated; lights, what it was photographed under."""
 
-    Several are solved jointly, in the first one's frame; the lights come back as the forward model
-    of each, prepared in that frame. keep: a folder for what the networks make of parts of large
-    images; what lies there is not computed again.
-    """
-    with stage("read"):
-        networks = _networks() if init == "network" else None
-    with stage("forward model"):
-        # Dr.Jit compiles here; nothing before needs it.
-        from invrender.refine.cautious import correct
-        from invrender.refine.flat import flat_maps
-        from invrender.refine.gauss_newton import Refined, Shot, refine
-        from invrender.refine.lobes import fit_lobes
-        from invrender.refine.priors import lobe_prior, network_prior, pooled
-        from invrender.refine.several import find_turn
-        from invrender.refine.theta import to_maps
+    photo: Array
+    clipped: Mask
+    lights: Lights
 
-        shots = [Shot(s.photo, s.renderer(), s.clipped if s.clipped.any() else None) for s in seen]
-    if networks is None:
-        with stage("initial maps"):
-            starts = [flat_maps(s.photo, s.renderer, samples) for s in shots]
-        with stage("materials"):
-            own = [fit_lobes(s.photo, s.renderer, samples) for s in shots]
-        turns = [0] + [find_turn(m, starts[0]) for m in starts[1:]]
-        prior = lobe_prior(own[0])
-    else:
-        reconstruct, improve = networks
+    @classmethod
+    def of(cls, found: FoundLights, size: int) -> Sample:
+        """Cut out of a capture's photo, ``size`` pixels a side."""
+        photo, rig = found.capture.photo, found.lights.rig
+        crop, clipped = crop_sample(photo, rig, size), crop_mask(photo, rig, size)
+        return cls(crop, clipped, found.lights)
 
-        def told(name: str) -> Callable[[float], None]:
-            return lambda share: stage.progress(f"{name}: {share:.0%}")
+    def shot(self, turn: int = 0) -> Shot:
+        """With its forward model, turned counter-clockwise by quarters."""
+        from invrender.refine.gauss_newton import Shot
+        from invrender.render.fast.estimator import Fast
 
-        with stage("initial maps"):
-            estimates = [
-                reconstruct(
-                    s.photo, s.lights.rig, s.lights.pattern, s.lights.gain,
-                    s.lights.environment if s.lights.environment.any() else None,
-                    s.lights.pattern_captured, told("initial maps"), keep,
-                )
-                for s in seen
-            ]  # fmt: skip
-        starts = [e.maps for e in estimates]
-        with stage("refine"):
-            for i, s in enumerate(shots):
-                estimates[i] = improve(
-                    s.photo, s.renderer, estimates[i], s.clipped, samples, told("refine")
-                )
-                if estimates[i].interrupted:
-                    break
-        turns = [0] + [find_turn(m, starts[0]) for m in starts[1:]]
-        priors = [
-            network_prior(turn_maps(e.maps, -k), {n: np.rot90(x, -k) for n, x in e.sigma.items()})
-            for e, k in zip(estimates, turns, strict=True)
-        ]
-        prior = pooled(priors)
-    with stage("forward model"):
-        shots = [
-            shot if k == 0 else _turned(s, k) for shot, s, k in zip(shots, seen, turns, strict=True)
-        ]
-    with stage("refine"):
-        if networks is None:
-            result = refine(
-                shots, prior, samples=samples,
-                progress=lambda i, e: stage.progress(f"refine: step {i}, photo error {e:.4f}"),
-            )  # fmt: skip
-        elif any(e.interrupted for e in estimates):
-            left = prior.sigma if prior.total is None else prior.total
-            result = Refined(to_maps(prior.mean), left, interrupted=True)
-        else:
-            result = correct(shots, prior, samples=samples)
-    return starts[0], result, shots
-
-
-def _turned(seen: Seen, quarters: int) -> Any:
-    """The shot in the frame of a photo that shows the sample ``quarters`` less turned."""
-    from invrender.refine.gauss_newton import Shot
-
-    clipped = np.rot90(seen.clipped, -quarters) if seen.clipped.any() else None
-    photo = np.ascontiguousarray(np.rot90(seen.photo, -quarters))
-    return Shot(photo, seen.renderer(-quarters), clipped)
+        photo = np.ascontiguousarray(np.rot90(self.photo, turn))
+        clipped = np.rot90(self.clipped, turn) if self.clipped.any() else None
+        return Shot(photo, Fast.under(self.lights.turned(turn)), clipped)
 
 
 def refine_capture(
-    folder: Path,
-    out: Path,
+    folder: str | Path,
+    out: str | Path,
     *,
-    more: Sequence[Path] = (),
+    more: Sequence[str | Path] = (),
     size: int = 256,
     init: str = "network",
     samples: int = 64,
@@ -205,107 +88,180 @@ def refine_capture(
     gain: Any = None,
     progress: Callable[[str], None] = lambda stage: None,
 ) -> Report:
-    """Recover the maps of a capture and write them, with lights, pictures and report, to ``out``.
+    """Reconstruct the maps of a capture's folder and save the result to ``out``: what
+    ``invrender refine`` does.
 
-    more: other captures of the same sample, solved jointly with the first, whose frame, lights and
-    pictures are written. size: pixels a side of the maps. init: where refinement starts, "network"
-    or "flat" (needs no torch). environment, gain: as for `see`. Raises `InputError` for bad input,
-    before anything is written. Ctrl-C during the refinement writes the best maps so far, and is
-    raised again; what the networks made of the parts of a large image stays beside ``out``, and
-    the same call goes on from there.
+    more: folders of other captures of the same sample. ball, environment, gain: as for
+    `find_lights`; the rest as for `reconstruct`. Raises `InputError` for bad input, before anything
+    is written. Ctrl-C during the refinement saves the best maps so far, and is raised again; what
+    the networks made of the parts of a large image stays beside ``out``, and the same call goes on
+    from there.
     """
     folders, out = [Path(folder), *map(Path, more)], Path(out)
+    check_output(out, folders, megabytes=MEGABYTES[0] * size**2 + MEGABYTES[1])
+    stage = Stages(progress)
+    with stage("read"):
+        captures = [load_capture(f) for f in folders]
+    with stage("lights"):
+        found = [find_lights(c, ball=ball, environment=environment, gain=gain) for c in captures]
+    unfinished = out.parent / f".{out.name}.unfinished"
+    result = _reconstruct(found, stage, size, init, samples, unfinished)
+    with stage("write"):
+        result.save(out)
+    if result.report.status == "interrupted":
+        raise KeyboardInterrupt(f"interrupted; {out} holds the best maps so far")
+    shutil.rmtree(unfinished, ignore_errors=True)
+    return result.report
+
+
+def reconstruct(
+    found: FoundLights | Sequence[FoundLights],
+    *,
+    size: int = 256,
+    init: str = "network",
+    samples: int = 64,
+    progress: Callable[[str], None] = lambda stage: None,
+) -> Result:
+    """The maps of a sample, from one photo or several and the lights found in them.
+
+    found: what `find_lights` returns for each capture. Several are of the same square of one
+    sample, which may lie turned by quarters, under other patterns or in other rooms; they are
+    solved together, and the result is in the first one's frame and has its lights. size: pixels a
+    side of the maps. init: "network", or "flat" for a start without a network. samples: of the
+    specular lobe. progress: is told what is being done. Raises `InputError` where the sample is not
+    wholly in the photo. Ctrl-C during the refinement ends it; the result's ``report.status`` is
+    "interrupted" then.
+
+        capture = invrender.load_capture("my-capture")
+        result = invrender.reconstruct(invrender.find_lights(capture))
+        result.save("out")
+    """
+    every = [found] if isinstance(found, FoundLights) else list(found)
+    return _reconstruct(every, Stages(progress), size, init, samples)
+
+
+def _reconstruct(
+    found: Sequence[FoundLights],
+    stage: Stages,
+    size: int,
+    init: str,
+    samples: int,
+    keep: Path | None = None,
+) -> Result:
     if size < 1:
         raise InputError(f"the size must be at least one pixel, got {size}")
-    if out.exists() and not out.is_dir():
-        raise InputError(f"{out} is a file; choose a folder for the results")
-    stage = Stages(progress)
-    seen = [see(f, size, stage, ball=ball, environment=environment, gain=gain) for f in folders]
-    unfinished = out.parent / f".{out.name}.unfinished"
-    start, result, shots = recover(seen, stage, init=init, samples=samples, keep=unfinished)
-    first = seen[0]
+    with stage("crop"):
+        crops = [Sample.of(f, size) for f in found]
+    start, refined, shots = estimate_maps(crops, stage, init, samples, keep)
+    first, lights, renderer = crops[0], found[0].lights, shots[0].renderer
     with stage("render"):
-        from invrender.refine.checks import baked_light
+        from invrender.refine.checks import baked_light, coarse_error, photo_error
+        from invrender.refine.theta import deviations
 
-        lights = shots[0].renderer
-        baked = baked_light(result.maps.diffuse, lights, samples)
-        pictures = [lights.render(maps, FINAL_SAMPLES) for maps in (start, result.maps)]
-    before, after = (photo_error(p, first.photo, first.clipped) for p in pictures)
-    coarse = coarse_error(pictures[1], first.photo, first.clipped)
-    errors = None
-    if first.capture.truth is not None:
-        truth = resize_maps(first.capture.truth, size, size)
-        errors = {"initial": map_errors(start, truth), "refined": map_errors(result.maps, truth)}
+        pictures = [renderer.render(maps, SAMPLES) for maps in (start, refined.maps)]
+        before, after = (photo_error(p, first.photo, first.clipped) for p in pictures)
+        baked = baked_light(refined.maps.diffuse, renderer, samples)
+        coarse = coarse_error(pictures[1], first.photo, first.clipped)
+        notices = map_notices(found[0].lights, first.clipped, refined, init, baked, coarse)
+    errors, capture = None, found[0].capture
+    if capture.truth is not None:
+        truth = resize_maps(capture.truth, size, size)
+        errors = {"initial": map_errors(start, truth), "refined": map_errors(refined.maps, truth)}
     report = Report(
-        capture=" + ".join(f.name for f in folders),
+        status="interrupted" if refined.interrupted else "done",
+        capture=" + ".join(f.capture.name for f in found),
         size=size,
         init=init,
-        sample_size=first.lights.rig.sample_size,
+        sample_size=lights.rig.sample_size,
         seconds=stage.seconds,
         photo_error={"initial": before, "refined": after},
-        converged=result.converged,
-        history=result.history,
-        capture_fit=_capture_fit(first),
-        warnings=_warnings(first, coarse, result, init, baked),
+        converged=refined.converged,
+        history=refined.history,
+        capture_fit=_capture_fit(found[0]),
+        warnings=[*found[0].notices, *notices],
         map_error=errors,
         versions={n: version(n) for n in ("invrender", "drjit", "mitsuba", "numpy")},
     )
-    with stage("write"):
-        write_results(out, report, first.lights, result, first.photo, pictures[1])
-    if result.interrupted:
-        raise KeyboardInterrupt(f"interrupted; {out} holds the best maps so far")
-    shutil.rmtree(unfinished, ignore_errors=True)
-    return report
+    estimate = Estimate(refined.maps, deviations(refined.sigma))
+    return Result(estimate, lights, first.photo, report, pictures[1])
 
 
-def _capture_fit(seen: Seen) -> dict[str, Any]:
-    fit: dict[str, Any] = {"gain": [float(g) for g in seen.lights.gain], **seen.lights.fit}
-    if seen.ball is not None:
-        fit["ball_centre"] = list(seen.ball.centre)
-        fit["ball_radius"] = seen.ball.radius
-        fit["ball_confidence"] = seen.ball.confidence
-    return fit
+def estimate_maps(
+    crops: Sequence[Sample],
+    stage: Stages,
+    init: str = "network",
+    samples: int = 64,
+    keep: Path | None = None,
+) -> tuple[Maps, Refined, list[Shot]]:
+    """Initial and refined maps, and the photos with their forward models in the first one's frame.
 
-
-def _networks() -> tuple[Any, Any]:
-    """The networks that come with the package: photo to maps, and their correction.
-
-    Raises `InputError` where torch is missing.
+    keep: a folder for what the networks make of parts of large images; what lies there is not
+    computed again.
     """
-    try:
-        from nets.predict import Corrector, Reconstructor
-    except ModuleNotFoundError as e:
-        raise InputError(
-            f"the network needs {e.name}: pip install 'invrender[nets]', or start flat: --init flat"
-        ) from None
-    return Reconstructor(), Corrector()
+    if init == "network":
+        with stage("read"):
+            from nets.predict import Corrector, Reconstructor
+
+            networks = Reconstructor(), Corrector()
+    with stage("forward model"):
+        # Dr.Jit compiles here; nothing before needs it.
+        from invrender.refine.cautious import correct
+        from invrender.refine.flat import flat_maps
+        from invrender.refine.gauss_newton import Refined, refine
+        from invrender.refine.lobes import fit_lobes
+        from invrender.refine.priors import lobe_prior, network_prior, pooled
+        from invrender.refine.several import find_turn
+        from invrender.refine.theta import to_maps
+
+        photos = [c.shot() for c in crops]
+    if init == "flat":
+        with stage("initial maps"):
+            starts = [flat_maps(p.photo, p.renderer, samples) for p in photos]
+        with stage("materials"):
+            own = [fit_lobes(p.photo, p.renderer, samples) for p in photos]
+        turns = [0] + [find_turn(m, starts[0]) for m in starts[1:]]
+        prior = lobe_prior(own[0])
+    else:
+        reconstruct, improve = networks
+        with stage("initial maps"):
+            told = stage.part("initial maps")
+            estimates = [reconstruct(c.photo, c.lights, told, keep) for c in crops]
+        starts = [e.maps for e in estimates]
+        with stage("refine"):
+            for i, p in enumerate(photos):
+                told = stage.part("refine")
+                estimates[i] = improve(p.photo, p.renderer, estimates[i], p.clipped, samples, told)
+                if estimates[i].interrupted:
+                    break
+        turns = [0] + [find_turn(m, starts[0]) for m in starts[1:]]
+        prior = pooled([
+            network_prior(turn_maps(e.maps, -k), {n: np.rot90(x, -k) for n, x in e.sigma.items()})
+            for e, k in zip(estimates, turns, strict=True)
+        ])  # fmt: skip
+    with stage("forward model"):
+        photos = [
+            photo if k == 0 else c.shot(-k)
+            for photo, c, k in zip(photos, crops, turns, strict=True)
+        ]
+    with stage("refine"):
+        if init == "flat":
+            result = refine(
+                photos, prior, samples=samples,
+                progress=lambda i, e: stage.progress(f"refine: step {i}, photo error {e:.4f}"),
+            )  # fmt: skip
+        elif any(e.interrupted for e in estimates):
+            left = prior.sigma if prior.total is None else prior.total
+            result = Refined(to_maps(prior.mean), left, interrupted=True)
+        else:
+            result = correct(photos, prior, samples=samples)
+    return starts[0], result, photos
 
 
-def _warnings(seen: Seen, error: float, result: Refined, init: str, baked: float) -> list[str]:
-    warnings = [notice.text for notice in seen.notices]
-    clipped, fit = seen.clipped, seen.lights.fit
-    if fit.get("screen_shift", 0) > FAR_OFF * seen.lights.rig.screen_size:
-        warnings.append(
-            f"in the ball, the screen hangs {1000 * fit['screen_shift']:.0f} mm from where "
-            "rig.toml says: check its sizes, above all the screen's height"
-        )
-    if clipped.any():
-        warnings.append(
-            f"{clipped.mean():.1%} of the sample is saturated in the photo; the maps keep their "
-            "initial values there: expose for the highlights"
-        )
-    if result.interrupted:
-        warnings.append("interrupted: these are the best maps so far")
-    elif not result.converged:
-        warnings.append("refinement had not converged when it reached its step limit")
-    if baked > BAKED:
-        warnings.append(
-            f"the albedo's colours follow the light's (correlation -{baked:.1f}): the light is "
-            "probably not where or what it is taken for; check the rig's sizes and the ball"
-        )
-    if error > POOR_FIT[init]:
-        warnings.append(
-            f"even the large shades of the photo are explained only to within {error:.0%} of its "
-            "mean: check the rig's sizes, the pattern and the ball"
-        )
-    return warnings
+def _capture_fit(found: FoundLights) -> dict[str, Any]:
+    gain = np.broadcast_to(np.asarray(found.lights.gain, np.float32), 3)
+    fit: dict[str, Any] = {"gain": [float(g) for g in gain], **found.lights.fit}
+    if found.ball is not None:
+        fit["ball_centre"] = list(found.ball.centre)
+        fit["ball_radius"] = found.ball.radius
+        fit["ball_confidence"] = found.ball.confidence
+    return fit

@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from invrender.maps import NAMES, Maps, resize_maps, unit_normals
+from invrender.lights import Lights
+from invrender.maps import NAMES, Estimate, Maps, resize_maps, unit_normals
 from invrender.refine.gauss_newton import linearise
 from invrender.refine.lobes import Lobes, fit_lobes, read_lobes
 from invrender.refine.theta import to_theta
 from invrender.render.fast.estimator import Fast
 from invrender.render.renderer import Renderer
 from invrender.render.scene import make_scene
-from invrender.rig import Rig
 from invrender.sampling import resize
 from invrender.types import Array, InputError
 from nets.batch import PIXELS, Batch, batch_of, lobe_input, positions
@@ -39,18 +39,15 @@ WHOLE = 256  # pixels of the longer side at which a sample is judged as a whole
 COARSE = 128  # pixels of the longer side at which the correction was trained
 
 
-@dataclass
-class Estimate:
-    """Maps, and for each the standard deviation (H, W) that the network expects of its error.
+@dataclass(frozen=True)
+class Prediction(Estimate):
+    """What a network estimates of a photo; where that says nothing the deviations are large.
 
-    Those of normals are of the encoded map, n/2 + 1/2; where the photo says nothing they are large.
     unit: the radiance of a white plane under the capture's lights. lobes: what
     `invrender.refine.lobes` found of the photo, at most `WHOLE` pixels a side. interrupted: by
     Ctrl-C, before all passes of the correction were done.
     """
 
-    maps: Maps
-    sigma: dict[str, Array]
     unit: float
     lobes: Lobes | None = None
     interrupted: bool = False
@@ -65,41 +62,37 @@ class Reconstructor:
     def __call__(
         self,
         photo: Array,
-        rig: Rig,
-        pattern: Array,
-        gain: Any,
-        environment: Array | None = None,
-        captured: Array | None = None,
+        lights: Lights,
         progress: Callable[[float], None] | None = None,
         keep: Path | None = None,
-    ) -> Estimate:
+    ) -> Prediction:
         """Maps of the sample from its photo (H, W, 3), linear radiance, row 0 at +y.
 
         The maps of a photo larger than `WHOLE` take their large shades and expected errors from it
         shrunk to that.
 
-        pattern (P, P, 3) and gain (RGB): the screen's radiance; environment (H, 2H, 3) radiance in
-        the photo's unit, whatever that is; captured: the screen's radiance as the ball shows it.
-        Pixels that are not finite count as black. ``progress`` is told the share done. keep: a
-        folder for the tiles of an image of several; those that lie there are not computed again.
+        lights: in the photo's unit of radiance, whatever that is. Pixels that are not finite count
+        as black. ``progress`` is told the share done. keep: a folder for the tiles of an image of
+        several; those that lie there are not computed again.
         """
         photo = np.asarray(photo, np.float32)
         if photo.ndim != 3 or photo.shape[2] != 3 or 0 in photo.shape:
             raise InputError(f"the photo must be (H, W, 3), got {photo.shape}")
         report = progress or (lambda _: None)
         report(0.0)
-        lights = light_inputs(rig, pattern, gain, environment, captured)
-        unit = white_level(lights)
+        rig, pattern, room = lights.rig, lights.pattern, lights.environment
+        inputs = light_inputs(rig, pattern, lights.gain, room, lights.pattern_captured)
+        unit = white_level(inputs)
         scale = 1 / max(unit, 1e-20)
-        scene = make_scene(rig, pattern, environment, np.asarray(gain) * scale, scale)
+        scene = make_scene(rig, pattern, room, np.asarray(lights.gain) * scale, scale)
         renderer = Fast(scene)
         report(0.3)
 
-        def maps_of(photo: Array, progress: Callable[[float], None] | None = None) -> Estimate:
+        def maps_of(photo: Array, progress: Callable[[float], None] | None = None) -> Prediction:
             seen = np.clip(np.nan_to_num(photo * scale, posinf=0.0, neginf=0.0), 0, 1e3)
             lobes = read_lobes(seen, renderer)
-            kept = keep and _kept(keep, self.notes, photo, *lights.values())
-            out = predict(self.network, batch_of(photo, lights, lobes), progress, kept)
+            kept = keep and _kept(keep, self.notes, photo, *inputs.values())
+            out = predict(self.network, batch_of(photo, inputs, lobes), progress, kept)
             return replace(estimate_of(out, unit), lobes=lobes)
 
         found = maps_of(photo, partial(_told, report, 0.3, 0.7))
@@ -118,11 +111,11 @@ class Corrector:
         self,
         photo: Array,
         renderer: Renderer,
-        estimate: Estimate,
+        estimate: Prediction,
         clipped: NDArray[np.bool_] | None = None,
         samples: int = 64,
         progress: Callable[[float], None] = lambda share: None,
-    ) -> Estimate:
+    ) -> Prediction:
         """Steps from an estimate towards what explains the photo (H, W, 3), until one changes
         roughness by less than `SETTLED` or there were `PASSES`; ``clipped``: where the photo is
         saturated. Ctrl-C ends it with what was found so far. ``progress`` is told the share done.
@@ -153,9 +146,9 @@ class Corrector:
         return estimate
 
     def _step(
-        self, photo: Array, renderer: Renderer, estimate: Estimate, lobes: Maps,
+        self, photo: Array, renderer: Renderer, estimate: Prediction, lobes: Maps,
         clipped: NDArray[np.bool_] | None, samples: int,
-    ) -> Estimate:  # fmt: skip
+    ) -> Prediction:  # fmt: skip
         """One pass."""
         inputs = linearised(photo, renderer, estimate, lobes, clipped, samples)
         batch = {k: torch.from_numpy(v)[None] for k, v in inputs.items()}
@@ -170,8 +163,8 @@ def _fitting(photo: Array, longest: int) -> tuple[int, int]:
 
 
 def _shrunk(
-    longest: int, photo: Array, estimate: Estimate, clipped: NDArray[np.bool_] | None
-) -> tuple[Array, Estimate, NDArray[np.bool_] | None]:
+    longest: int, photo: Array, estimate: Prediction, clipped: NDArray[np.bool_] | None
+) -> tuple[Array, Prediction, NDArray[np.bool_] | None]:
     """All of it shrunk until the longer side is ``longest``; what touches a saturated pixel is."""
     low = _fitting(photo, longest)
     few = None if clipped is None else resize(clipped.astype(np.float32), *low) > 0
@@ -183,7 +176,7 @@ def _resized(sigma: dict[str, Array], height: int, width: int) -> dict[str, Arra
     return {k: resize(v, height, width) for k, v in sigma.items()}
 
 
-def _shaded(estimate: Estimate, coarse: Estimate, names: Iterable[str]) -> Estimate:
+def _shaded(estimate: Prediction, coarse: Prediction, names: Iterable[str]) -> Prediction:
     """The estimate, whose maps ``names`` take from a coarser one all that this one can show."""
     own, maps = resize_maps(estimate.maps, *coarse.maps.shape), dict(vars(estimate.maps))
     for name in names:
@@ -194,7 +187,7 @@ def _shaded(estimate: Estimate, coarse: Estimate, names: Iterable[str]) -> Estim
     return replace(estimate, maps=Maps(diffuse, specular, roughness, normal))
 
 
-def _joined(fine: Estimate, whole: Estimate) -> Estimate:
+def _joined(fine: Prediction, whole: Prediction) -> Prediction:
     """An estimate with the large shades and the expected errors of a coarser one."""
     shaded, sigma = _shaded(fine, whole, NAMES), _resized(whole.sigma, *fine.maps.shape)
     return replace(shaded, sigma=sigma, lobes=whole.lobes, interrupted=whole.interrupted)
@@ -219,7 +212,7 @@ def _kept(folder: Path, notes: dict[str, Any], photo: Array, *seen: NDArray[Any]
 def linearised(
     photo: Array,
     renderer: Renderer,
-    estimate: Estimate,
+    estimate: Prediction,
     lobes: Maps,
     clipped: NDArray[np.bool_] | None,
     samples: int,
@@ -305,7 +298,7 @@ def _ramp(part: slice, length: int) -> Tensor:
     return torch.minimum(rise, fall).clamp(max=1)
 
 
-def estimate_of(out: Batch, unit: float) -> Estimate:
+def estimate_of(out: Batch, unit: float) -> Prediction:
     """The first capture of a network's output, as numpy arrays."""
     image = lambda x: np.ascontiguousarray(x[0].permute(1, 2, 0).numpy())  # noqa: E731
     normal = image(out["normal"])
@@ -314,4 +307,4 @@ def estimate_of(out: Batch, unit: float) -> Estimate:
         image(out["diffuse"]), image(out["specular"]), image(out["roughness"])[..., 0], normal
     )
     sigma = image(out["sigma"])
-    return Estimate(maps, {k: sigma[..., i] for i, k in enumerate(MAPS)}, unit)
+    return Prediction(maps, {k: sigma[..., i] for i, k in enumerate(MAPS)}, unit)

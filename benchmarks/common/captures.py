@@ -10,7 +10,7 @@ import argparse
 import io
 import os
 import tempfile
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from benchmarks.common.results import benchmark_parser
-from invrender.capture.lights import Lights, known_lights
 from invrender.colour import linear_to_srgb
 from invrender.data.environments import find_environments, procedural_environment, read_environment
 from invrender.data.materials import find_materials, procedural_material, read_material
@@ -28,6 +27,7 @@ from invrender.files.capture import Capture
 from invrender.files.images import read_image
 from invrender.files.rig_toml import read_rig
 from invrender.files.write import write_exr
+from invrender.lights import Lights
 from invrender.maps import Maps, crop_maps, resize_maps, turn_maps
 from invrender.pattern.default import default_pattern
 from invrender.rig import Rig
@@ -146,7 +146,7 @@ def true_lights(folder: Path, capture: Capture) -> Lights:
     room = np.asarray(capture.true_environment, np.float32)
     gain = GAIN if capture.photo.clip_level is None else 1 / float(capture.pattern.max())
     rig = read_rig(folder / "truth" / "rig.toml").rig
-    return replace(known_lights(capture, room, gain), rig=rig)
+    return Lights(rig, capture.pattern, room, gain)
 
 
 def _material(folders: list[Path], k: int, size: int) -> Maps:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,37 +22,9 @@ from invrender.capture.screen import Screen, fit_screen
 from invrender.capture.settings import PATTERN_CHECK, SCREEN_FIT, TABLE_LEVEL, UNFOLDING
 from invrender.files.capture import Capture
 from invrender.files.images import Photo
+from invrender.lights import Lights
 from invrender.rig import Rig
 from invrender.types import Array, InputError, Notice
-
-
-@dataclass(frozen=True)
-class Lights:
-    """The light on the sample, in the photo's radiance units.
-
-    ``environment`` (H, 2H, 3): radiance, filled in behind the screen, zero below the horizon;
-    ``coverage`` (H, 2H): the share of each texel that the ball really shows. The screen's radiance
-    is ``gain`` (3,) times ``pattern`` (h, w, 3); ``pattern_captured`` is what the ball shows of it,
-    rectified. ``fit`` says how well: ``residual`` of the pattern's fit relative to the gain,
-    ``gamma`` the exponent on the pattern that fits best (1: as it should be; the gain is for 1),
-    ``blur`` the camera's in pixels, ``pixels`` the number used, ``saturated`` and
-    ``room_saturated`` the shares of screen and room in the ball that are saturated,
-    ``room_raised`` how many times brighter the saturated lamps were made, ``hidden_lamp`` how many
-    times brighter than the filling a part of the room behind the screen was made (1: none),
-    ``pattern_residual`` the residual before the screen's pose and curve were fitted,
-    ``camera_tilt`` how far the camera is found to look past straight down, in degrees. Where the
-    pattern as it should be fits badly, ``pattern`` is as the display really shows it, and ``rig``
-    as the screen really hangs; else both are those of the capture, but for the tilt
-    (`level_table`).
-    """
-
-    environment: Array
-    coverage: Array
-    pattern: Array
-    gain: Array
-    pattern_captured: Array
-    rig: Rig
-    fit: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -109,7 +81,7 @@ def known_lights(capture: Capture, environment: Array, gain: Any) -> Lights:
     """Lights that a person states: the pattern is taken to be shown as it should be."""
     covered = np.ones(environment.shape[:2], np.float32)
     shown = (capture.pattern * _rgb(gain)).astype(np.float32)
-    return Lights(environment, covered, capture.pattern, _rgb(gain), shown, capture.rig)
+    return Lights(capture.rig, capture.pattern, environment, _rgb(gain), covered, shown)
 
 
 def _rgb(gain: Any) -> Array:
@@ -147,7 +119,7 @@ def measure_lights(capture: Capture, ball: Ball, height: int = UNFOLDING.height)
     )
     size = min(PATTERN_CHECK.captured_size, max(pattern.shape[:2]))
     captured = unfold_pattern(photo, rig, ball, size)
-    return Lights(environment, coverage, pattern, gain, captured, rig, fit)
+    return Lights(rig, pattern, environment, gain, coverage, captured, fit)
 
 
 def level_table(photo: Photo, rig: Rig, ball: Ball) -> Rig:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from invrender.report.page import Report
+from invrender.files.output import check_output
+from invrender.report.report import Report
 from invrender.tasks import map_tasks
 from invrender.types import InputError
 
@@ -48,8 +48,8 @@ def refine_captures(
     twice = sorted({n for n in names if names.count(n) > 1})
     if twice:
         raise InputError(f"two captures have the name '{twice[0]}'; rename one of the folders")
-    if out.exists() and not out.is_dir():
-        raise InputError(f"{out} is a file; choose a folder for the results")
+    for name in names:
+        check_output(out / name, folders)
     jobs = []
     for folder, name in zip(folders, names, strict=True):
         report = finished(out / name, options.get("size", 256), options.get("init", "network"))
@@ -70,11 +70,11 @@ def refine_captures(
 def finished(folder: Path, size: int, init: str) -> Report | None:
     """The report of a result that needs no second run, else None. It is the last file written."""
     try:
-        report = Report(**json.loads((folder / "report.json").read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError):
+        report = Report.read(folder)
+    except InputError:
         return None
-    stopped = any(w.startswith("interrupted") for w in report.warnings)
-    return report if (report.size, report.init) == (size, init) and not stopped else None
+    same = (report.size, report.init, report.status) == (size, init, "done")
+    return report if same else None
 
 
 def _refine(job: tuple[Path, Path, dict[str, Any]]) -> Report:

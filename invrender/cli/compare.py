@@ -60,10 +60,12 @@ def _maps(folder: Path) -> tuple[Any, Any]:
     """(Maps, its rig or None) of a folder of maps, or of a capture with ground truth."""
     from invrender.files.capture import load_capture
     from invrender.files.maps import read_maps
+    from invrender.files.rig_toml import read_rig
     from invrender.types import InputError
 
-    if not (folder / "rig.toml").is_file():
-        return read_maps(folder), None
+    rig = folder / "rig.toml"
+    if (folder / "normal.exr").is_file() or not rig.is_file():
+        return read_maps(folder), read_rig(rig).rig if rig.is_file() else None
     capture = load_capture(folder)
     if capture.truth is None:
         raise InputError(f"{folder} is a capture without ground truth: there are no maps in it")

@@ -15,13 +15,14 @@ if TYPE_CHECKING:
 
 # What each optional module is for, and the extra that brings it.
 OPTIONAL = {
-    "torch": "the network for the initial maps (nets)",
-    "kornia": "the network for the initial maps (nets)",
     "MaterialX": "export to MaterialX (export)",
     "flip_evaluator": "the metric FLIP (metrics)",
     "distributed": "a Dask cluster (cluster)",
 }
-REQUIRED = ("invrender", "drjit", "mitsuba", "numpy", "scipy", "scikit-image", "OpenEXR", "pillow")
+REQUIRED = (
+    "invrender", "drjit", "mitsuba", "torch", "kornia", "numpy", "scipy", "scikit-image", "OpenEXR",
+    "pillow",
+)  # fmt: skip
 
 
 def add_parser(commands: Any) -> None:
@@ -116,8 +117,6 @@ def _render() -> str:
 
 
 def _network() -> str:
-    if importlib.util.find_spec("torch") is None:
-        return "not installed; refine with --init flat, or pip install 'invrender[nets]'"
     from nets.predict import Reconstructor
 
     Reconstructor()

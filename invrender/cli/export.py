@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
     from invrender.export import Exported
 
+FILES = (".glb", ".usdz", ".zip")  # else a folder is written
 EXPORT_TARGETS = (
     "gltf", "usd", "materialx", "blender", "unreal", "unity", "godot", "ambientcg", "polyhaven",
     "mitsuba",
@@ -68,6 +69,9 @@ def add_parser(commands: Any) -> None:
 def run(args: argparse.Namespace, console: Console) -> int:
     """Run the subcommand."""
     from invrender.export import export
+    from invrender.files.output import check_output
+
+    check_output(args.out, [args.result], file=args.out.suffix.lower() in FILES)
 
     with console.status(f"exporting to {args.to} …"):
         done = export(

@@ -44,6 +44,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     """Run the subcommand."""
     from rich.progress import Progress
 
+    from invrender.files.output import check_output
     from invrender.files.rig_toml import read_rig
     from invrender.files.write import atomic_path, write_exr, write_png
     from invrender.pattern.default import default_pattern, mirrored
@@ -68,6 +69,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
         raise InputError("the seed must not be negative")
     if not args.out.resolve().parent.is_dir():
         raise InputError(f"{args.out.parent} is not a folder")
+    check_output(args.out, [args.rig] if args.rig else [], file=True)
     if args.rig and not (args.optimise or real or suffix == ".pdf"):
         raise InputError(
             "--rig is for --optimise, --ppi, .html and .pdf; the default pattern is the same for "

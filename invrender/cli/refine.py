@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from rich.console import Console
 
+    from invrender.cli.batch import Outcome
+
 
 def add_parser(commands: Any) -> None:
     """Add the subcommand to argparse's subparsers."""
@@ -36,7 +38,7 @@ def add_parser(commands: Any) -> None:
         "--init",
         choices=["network", "flat"],
         default="network",
-        help="where refinement starts: the network's maps (default), or flat, which needs no torch",
+        help="where refinement starts: the network's maps (default), or a flat sample's",
     )
     parser.add_argument(
         "--samples", type=int, default=64, help="samples a pixel of the specular lobe (64)"
@@ -91,7 +93,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
         first, *more = folders
         report = refine_capture(first, args.out, more=more, progress=progress, **options)
     if args.json:
-        print(json.dumps(report.__dict__))
+        print(json.dumps(report.to_dict()))
         return 0
     total = sum(report.seconds.values())
     slowest = sorted(report.seconds.items(), key=lambda kv: -kv[1])[:4]
@@ -107,7 +109,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
             after = report.map_error["refined"][name]
             console.print(f"  {name:>9} error {before:.4f} → {after:.4f}")
     for warning in report.warnings:
-        console.print(f"  warning: {warning}")
+        console.print(f"  warning: {warning.text}")
     return 0
 
 
@@ -143,13 +145,18 @@ def _refine_several(
             ]  # fmt: skip
         table.add_row(o.name, o.status, *cells)
     if args.json:
-        print(json.dumps([asdict(o) for o in outcomes]))
+        print(json.dumps([_outcome(o) for o in outcomes]))
     else:
         console.print(table)
     for o in outcomes:
         if o.error:
             Console(stderr=True, markup=False, highlight=False).print(f"{o.name}: {o.error}")
     return 1 if any(o.status == "failed" for o in outcomes) else 0
+
+
+def _outcome(outcome: Outcome) -> dict[str, Any]:
+    report = None if outcome.report is None else outcome.report.to_dict()
+    return {**asdict(outcome), "report": report}
 
 
 def _room(name: str | None) -> NDArray[Any] | None:

@@ -38,6 +38,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     from invrender.data.materials import procedural_material, read_material
     from invrender.data.simulate import simulate
     from invrender.files.images import read_image
+    from invrender.files.output import check_output
     from invrender.maps import resize_maps
     from invrender.pattern.default import default_pattern
     from invrender.rig import Rig
@@ -46,6 +47,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
     if args.size < 1 or args.width < 64 or args.spp < 1:
         raise InputError("sizes and sample counts must be positive, the photo 64 pixels or wider")
+    given = [path for path in (args.maps, args.environment, args.pattern) if path]
+    check_output(args.out, given, megabytes=20e-6 * args.width**2 + 5)
     if args.maps:
         maps = resize_maps(read_material(args.maps), args.size, args.size)
     else:

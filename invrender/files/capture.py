@@ -34,9 +34,10 @@ class Capture:
     true_environment: Array | None = None
     fov_from: str = "rig"
     warnings: tuple[Notice, ...] = ()
+    name: str = "capture"
 
 
-def load_capture(folder: Path) -> Capture:
+def load_capture(folder: str | Path) -> Capture:
     """Read a capture folder: ``photo.*``, ``rig.toml``, the pattern, and the truth if there is any.
 
     Raises `InputError`, one sentence, for anything missing, damaged or out of range.
@@ -68,7 +69,7 @@ def load_capture(folder: Path) -> Capture:
             environment = read_image(maps / "environment.exr")
     return Capture(
         photo, rig, np.clip(pattern, 0, 1), truth, environment, fov_from,
-        (*photo.warnings, *warnings),
+        (*photo.warnings, *warnings), folder.resolve().name,
     )  # fmt: skip
 
 

@@ -27,6 +27,13 @@ def to_maps(theta: Array) -> Maps:
     return Maps(*(np.ascontiguousarray(p, dtype=np.float32) for p in parts))
 
 
+def deviations(sigma: Array) -> dict[str, Array]:
+    """Standard deviation of each map from those of θ (H, W, 9); of normals that of n/2 + 1/2."""
+    slopes = np.sqrt(np.mean(sigma[..., N] ** 2, -1)) / 2
+    parts = {"diffuse": sigma[..., D], "specular": sigma[..., S], "roughness": sigma[..., R]}
+    return {k: np.ascontiguousarray(v, np.float32) for k, v in {**parts, "normal": slopes}.items()}
+
+
 def project(theta: Array) -> Array:
     """θ within its physical range, in place: what a surface mirrors it cannot scatter too."""
     _in_range(theta)

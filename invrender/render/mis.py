@@ -105,7 +105,8 @@ class Mis(Renderer):
     """
 
     def __init__(self, scene: Scene, sampler: EnvironmentSampler | None = None) -> None:
-        self.scene, self.sampler = scene, sampler or EnvironmentSampler.build(scene)
+        super().__init__(scene)
+        self.sampler = sampler or EnvironmentSampler.build(scene)
 
     def _shade(
         self, view: View, roughness: Any, normal: Any, samples: int, jacobian: bool

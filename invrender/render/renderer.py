@@ -13,15 +13,16 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from invrender.lights import Lights
 from invrender.maps import Maps
 from invrender.render import brdf
 from invrender.render.backend import Float, dr, vector
-from invrender.render.scene import Scene, View, aligned, make_view
+from invrender.render.scene import Scene, View, aligned, make_scene, make_view
 from invrender.render.shading import Shading
 
 TILE = 1 << 20  # pixels rendered at once
@@ -52,7 +53,13 @@ class Renderer(ABC):
     It has two kinds, `invrender.render.Fast` and `invrender.render.Mis`.
     """
 
-    scene: Scene
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+
+    @classmethod
+    def under(cls, lights: Lights) -> Self:
+        """Prepared for these lights."""
+        return cls(make_scene(lights.rig, lights.pattern, lights.environment, lights.gain))
 
     @abstractmethod
     def _shade(

@@ -9,7 +9,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import io
-from dataclasses import dataclass
 from importlib import resources
 from typing import Any
 
@@ -21,6 +20,7 @@ from PIL import Image
 
 from invrender.colour import linear_to_srgb
 from invrender.maps import Maps
+from invrender.report.report import Report
 from invrender.sphere import irradiance
 from invrender.types import Array
 
@@ -43,24 +43,6 @@ TITLES = {
 }
 
 
-@dataclass
-class Report:
-    """What a run measured; written as ``report.json``. ``sample_size`` is in metres."""
-
-    capture: str
-    size: int
-    init: str
-    sample_size: float
-    seconds: dict[str, float]
-    photo_error: dict[str, float]
-    converged: bool
-    history: list[dict[str, float]]
-    capture_fit: dict[str, Any]
-    warnings: list[str]
-    map_error: dict[str, dict[str, float]] | None
-    versions: dict[str, str]
-
-
 def report_html(
     report: Report,
     maps: Maps,
@@ -70,7 +52,7 @@ def report_html(
     photo: Array,
     picture: Array,
 ) -> str:
-    """The page. sigma: of each encoded map, see `invrender.report.results.deviations`. environment:
+    """The page. sigma: of each encoded map, see `invrender.maps.Estimate`. environment:
     (H, 2H, 3) radiance; pattern: (h, w, 3) the screen's radiance as captured; photo, picture:
     (N, N, 3) radiance of the sample and of its re-rendering."""
     white = max(float(np.percentile(photo, 99.5)), 1e-12)
@@ -114,7 +96,7 @@ def report_html(
     )
     total = sum(report.seconds.values())
     return page.render(
-        report=report.__dict__,
+        report=report,
         css=_data("report.css"),
         script=script,
         script_hash=f"sha256-{digest}",

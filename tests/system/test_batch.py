@@ -1,7 +1,7 @@
 """Several captures at once: none stops the others, what is done is skipped. The doctor."""
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import pytest
 
@@ -9,11 +9,11 @@ import invrender.pipeline
 from invrender.cli import doctor
 from invrender.cli.batch import finished
 from invrender.cli.main import main
-from invrender.report.page import Report
+from invrender.report.report import Report
 from invrender.types import InputError
 
 REPORT = Report(
-    capture="", size=256, init="network", sample_size=0.09, seconds={"refine": 1.0},
+    status="done", capture="", size=256, init="network", sample_size=0.09, seconds={"refine": 1.0},
     photo_error={"initial": 0.2, "refined": 0.1}, converged=True, history=[], capture_fit={},
     warnings=[], map_error=None, versions={},
 )  # fmt: skip
@@ -32,7 +32,7 @@ def runs(monkeypatch):
             raise ZeroDivisionError("oh")
         report = replace(REPORT, capture=folder.name, size=size)
         out.mkdir(parents=True, exist_ok=True)
-        (out / "report.json").write_text(json.dumps(asdict(report)))
+        (out / "report.json").write_text(json.dumps(report.to_dict()))
         return report
 
     monkeypatch.setattr(invrender.pipeline, "refine_capture", refine)
@@ -61,7 +61,7 @@ def test_what_is_done_is_skipped(runs, tmp_path, capsys):
     # A damaged report, an interrupted run or another size are no reason to skip.
     (out / "a" / "report.json").write_text("{}")
     assert finished(out / "a", 256, "network") is None
-    stopped = asdict(REPORT) | {"warnings": ["interrupted: so far"]}
+    stopped = REPORT.to_dict() | {"status": "interrupted"}
     (out / "a" / "report.json").write_text(json.dumps(stopped))
     assert finished(out / "a", 256, "network") is None
     assert finished(out / "b", 512, "network") is None

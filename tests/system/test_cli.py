@@ -43,7 +43,8 @@ def test_network_starts_nearer(result, tmp_path):
 def test_result_is_complete(result):
     names = {f"{n}.{e}" for n in NAMES for e in ("exr", "png")}
     names |= {f"sigma_{n}.exr" for n in NAMES}
-    names |= {"environment.exr", "pattern.exr", "report.json", "report.html"}
+    names |= {"environment.exr", "coverage.exr", "pattern_shown.exr", "pattern_captured.exr"}
+    names |= {"rig.toml", "sample.exr", "report.json", "report.html"}
     names |= {"photo.png", "render.png", "difference.png"}
     assert {p.name for p in result.iterdir()} == names
     assert read_maps(result).shape == (96, 96)

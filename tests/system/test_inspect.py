@@ -9,13 +9,14 @@ from PIL import Image
 from scipy import ndimage
 from synthetic_photo import blocks, photograph
 
-from invrender.capture.lights import Lights, light_warnings
+from invrender.capture.lights import light_warnings
 from invrender.capture.orientation import oriented
 from invrender.capture.settings import SCREEN_FIT
 from invrender.cli.main import main
 from invrender.colour import linear_to_srgb
 from invrender.files.rig_toml import write_rig
 from invrender.files.write import write_exr
+from invrender.lights import Lights
 from invrender.pattern.default import default_pattern
 from invrender.rig import Rig
 
@@ -42,7 +43,7 @@ def test_inspect_tells_the_truth_and_draws_it(folder, tmp_path, capsys):
     with Image.open(tmp_path / "out" / "inspect.png") as picture:
         assert picture.size == (SIZE[1], SIZE[0])
     names = {p.name for p in (tmp_path / "out").iterdir()}
-    assert names == {"inspect.png", "environment.exr", "coverage.exr", "pattern.exr"}
+    assert names == {"inspect.png", "environment.exr", "coverage.exr", "pattern_captured.exr"}
 
 
 def test_inspect_takes_a_lone_photo(tmp_path, capsys):
@@ -73,15 +74,13 @@ def test_a_ball_without_the_pattern_is_refused(folder, tmp_path, capsys):
 
 
 def test_saturated_lights_are_told():
-    lights = Lights(
-        *(np.zeros((1, 1)),) * 3, np.ones(3), np.zeros((1, 1)), RIG,
-        {"saturated": 2 * SCREEN_FIT.saturated, "room_saturated": 0.02, "pattern_residual": 0.5},
-    )  # fmt: skip
+    fit = {"saturated": 2 * SCREEN_FIT.saturated, "room_saturated": 0.02, "pattern_residual": 0.5}
+    lights = Lights(RIG, np.ones((1, 1, 3)), fit=fit)
     notices = light_warnings(lights)
     assert [n.code for n in notices] == ["screen-saturated", "room-saturated", "pattern-fits-badly"]
     text = " ".join(n.text for n in notices)
     assert "2% of the screen" in text and "2.0% of the room" in text and "this pattern" in text
-    assert not light_warnings(Lights(*(np.zeros((1, 1)),) * 3, np.ones(3), np.zeros(1), RIG))
+    assert not light_warnings(replace(lights, fit={}))
 
 
 # --- photos that are not as they should be ------------------------------------------------------
@@ -106,7 +105,7 @@ def test_a_turned_photo_is_set_upright(image, quarter, tmp_path, capsys):
     write_exr(tmp_path / "a.exr", np.rot90(image, -quarter))
     found = inspected(capsys, tmp_path / "a.exr")
     assert found["photo"] == [SIZE[1], SIZE[0]]
-    assert found["warnings"] == [
+    assert [w["text"] for w in found["warnings"]] == [
         f"the photo was turned by {90 * quarter}° counter-clockwise: the ball shows which side is "
         "up"
     ]
@@ -119,7 +118,9 @@ def test_another_orientation_of_the_pattern_is_taken_as_shown(quarter, flip, tmp
     shown = oriented(default_pattern(64), quarter, flip)
     write_exr(tmp_path / "a.exr", photograph(RIG, *SIZE, pattern=shown))
     found = inspected(capsys, tmp_path / "a.exr")
-    assert len(found["warnings"]) == 1 and "display shows the pattern" in found["warnings"][0]
+    assert (
+        len(found["warnings"]) == 1 and "display shows the pattern" in found["warnings"][0]["text"]
+    )
     assert found["fit"]["residual"] < 0.05
     np.testing.assert_allclose(found["gain"], [2.0, 2.1, 1.9], rtol=0.02)
 
@@ -185,11 +186,11 @@ def test_doubtful_photos_are_told(image, change, match, tmp_path, capsys):
     write_exr(tmp_path / "pattern.exr", default_pattern(64))
     write_rig(tmp_path / "rig.toml", replace(RIG, fov=float(fov)), "pattern.exr")
     found = inspected(capsys, tmp_path)
-    assert any(match in w for w in found["warnings"])
+    assert any(match in w["text"] for w in found["warnings"])
 
 
 def test_a_weak_pattern_is_told(tmp_path, capsys):
     dim = photograph(RIG, *SIZE, pattern=default_pattern(64), gain=(0.1, 0.1, 0.1))
     write_exr(tmp_path / "a.exr", dim)
     found = inspected(capsys, tmp_path / "a.exr")
-    assert isinstance(found, str) or any("only" in w for w in found["warnings"])
+    assert isinstance(found, str) or any("only" in w["text"] for w in found["warnings"])

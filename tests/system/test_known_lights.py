@@ -7,12 +7,13 @@ import pytest
 import synthetic_photo
 from synthetic_photo import blocks, grey_table, photograph
 
+import invrender
 from invrender.cli.main import main
 from invrender.files.maps import write_maps
 from invrender.files.rig_toml import write_rig
 from invrender.files.write import write_exr
 from invrender.maps import constant_maps
-from invrender.pipeline import Stages, recover, refine_capture, see
+from invrender.pipeline import refine_capture
 from invrender.render import Fast, make_scene
 from invrender.rig import Rig
 
@@ -65,10 +66,10 @@ def test_dark_room_without_ball(tmp_path, truth):
     out = tmp_path / "out"
     assert main(["refine", str(folder), "-o", str(out), "--size", str(SIZE), *arguments]) == 0
     assert (out / "roughness.exr").is_file() and (out / "report.html").is_file()
-    stage = Stages()
-    seen = see(folder, SIZE, stage, environment=np.zeros((8, 16, 3), np.float32), gain=GAIN)
-    _, result, _ = recover([seen], stage, init="flat")
-    assert seen.ball is None
+    dark = np.zeros((8, 16, 3), np.float32)
+    found = invrender.find_lights(invrender.load_capture(folder), environment=dark, gain=GAIN)
+    result = invrender.reconstruct(found, size=SIZE, init="flat")
+    assert found.ball is None
     assert np.abs(result.maps.diffuse - truth.diffuse).mean() < 0.03
 
 

@@ -116,6 +116,8 @@ def test_compare(tmp_path, capsys):
     assert "average  0.0000" in capsys.readouterr().out
     truth, rig = compare_cli._maps(EXAMPLE)  # of a capture, its ground truth
     assert truth.shape == read_maps(EXAMPLE / "truth").shape and rig is not None
+    same, rig = compare_cli._maps(EXAMPLE / "truth")  # maps with a rig beside them, as results are
+    assert np.array_equal(same.diffuse, truth.diffuse) and rig is not None
 
 
 def test_compare_images(tmp_path, capsys):

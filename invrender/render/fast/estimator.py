@@ -33,7 +33,8 @@ class Fast(Renderer):
     """
 
     def __init__(self, scene: Scene, detail: int = 1) -> None:
-        self.scene, self.tables = scene, fast_tables(scene, detail)
+        super().__init__(scene)
+        self.tables = fast_tables(scene, detail)
 
     def _shade(
         self, view: View, roughness: Any, normal: Any, samples: int, jacobian: bool

@@ -6,10 +6,12 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from invrender.capture.lights import find_lights  # noqa: E402
 from invrender.data import EXAMPLE  # noqa: E402
+from invrender.files.capture import load_capture  # noqa: E402
 from invrender.maps import constant_maps, resize_maps  # noqa: E402
 from invrender.pattern.default import block_pattern  # noqa: E402
-from invrender.pipeline import Stages, recover, refine_capture, see  # noqa: E402
+from invrender.pipeline import Sample, Stages, estimate_maps, refine_capture  # noqa: E402
 from invrender.refine.lobes import fit_lobes  # noqa: E402
 from invrender.render import Fast, Material  # noqa: E402
 from invrender.render.scene import make_scene, make_view  # noqa: E402
@@ -17,7 +19,7 @@ from invrender.rig import Rig  # noqa: E402
 from invrender.sampling import resize  # noqa: E402
 from nets.batch import positions  # noqa: E402
 from nets.correction import ALBEDO_CORRELATION, INPUTS, NOISE, Correction, features, gauss_newton  # noqa: E402
-from nets.predict import Corrector, Estimate, Reconstructor, linearised  # noqa: E402
+from nets.predict import Corrector, Prediction, linearised  # noqa: E402
 from nets.store import build, load_weights, save_weights  # noqa: E402
 
 SIZE = 12
@@ -38,7 +40,7 @@ def lit():
 def guess(diffuse=0.3, unit=0.7):
     sigma = {"normal": 0.05, "diffuse": 0.1, "roughness": 0.1, "specular": 0.05}
     grids = {k: np.full((SIZE, SIZE), v, np.float32) for k, v in sigma.items()}
-    return Estimate(constant_maps(SIZE, SIZE, diffuse, 0.04, 0.5), grids, unit)
+    return Prediction(constant_maps(SIZE, SIZE, diffuse, 0.04, 0.5), grids, unit)
 
 
 def random_batch(dtype=torch.float64):
@@ -209,7 +211,7 @@ def test_of_a_large_photo_the_large_shades_are_corrected(lit, monkeypatch):
     low = (SIZE // 2, SIZE // 2)
     start = guess()
     start.maps.diffuse[::2] += 0.01
-    small = Estimate(
+    small = Prediction(
         resize_maps(start.maps, *low), {k: resize(v, *low) for k, v in start.sigma.items()}, 0.7
     )
     whole = corrector(resize(photo, *low), renderer, small)
@@ -250,7 +252,8 @@ def test_an_interrupted_run_leaves_the_best_and_goes_on(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt, match="best maps so far"):
         refine_capture(EXAMPLE, out, size=24)
     report = json.loads((out / "report.json").read_text())
-    assert "interrupted: these are the best maps so far" in report["warnings"]
+    assert report["status"] == "interrupted"
+    assert "interrupted" in [w["code"] for w in report["warnings"]]
     assert report["map_error"]["initial"] == pytest.approx(report["map_error"]["refined"], rel=0.05)
     assert len(list(parts.glob("*/*.safetensors"))) == 4  # the first network's tiles
     monkeypatch.setattr(Correction, "forward", forward)
@@ -263,15 +266,15 @@ def test_an_interrupted_run_leaves_the_best_and_goes_on(tmp_path, monkeypatch):
 
 
 def test_an_interrupt_ends_all_photos(monkeypatch):
-    seen = see(EXAMPLE, 16, Stages())
+    sample = Sample.of(find_lights(load_capture(EXAMPLE)), 16)
     calls = []
 
     def improve(photo, renderer, estimate, *_):
         calls.append(photo)
         return replace(estimate, interrupted=True)
 
-    monkeypatch.setattr("invrender.pipeline._networks", lambda: (Reconstructor(), improve))
-    maps, result, _ = recover([seen, seen], Stages())
+    monkeypatch.setattr("nets.predict.Corrector", lambda: improve)
+    maps, result, _ = estimate_maps([sample, sample], Stages())
     assert len(calls) == 1 and result.interrupted
     np.testing.assert_allclose(result.maps.diffuse, maps.diffuse, atol=0.02)
 

@@ -9,6 +9,7 @@ torch = pytest.importorskip("torch")
 from safetensors.torch import save_file  # noqa: E402
 
 from invrender.data.environments import procedural_environment  # noqa: E402
+from invrender.lights import Lights  # noqa: E402
 from invrender.maps import constant_maps  # noqa: E402
 from invrender.pattern.default import block_pattern  # noqa: E402
 from invrender.refine.evidence import MaterialEvidence  # noqa: E402
@@ -432,7 +433,7 @@ def test_inference_at_any_size(reconstructor, shape):
     env = scale_environment(procedural_environment(5, 32), 0.5)
     steps = []
     result = reconstructor(
-        rng.random((*shape, 3)), RIG, block_pattern(64), 1.0, env, progress=steps.append
+        rng.random((*shape, 3)), Lights(RIG, block_pattern(64), env), progress=steps.append
     )
     assert result.maps.shape == shape and set(result.sigma) == set(result.maps.encoded())
     assert all(v.shape == shape and (v > 0).all() for v in result.sigma.values())
@@ -446,20 +447,20 @@ def test_lobes_are_those_of_the_photo_in_any_unit(reconstructor):
     env = scale_environment(procedural_environment(5, 32), 0.5)
     maps = constant_maps(24, 24, diffuse=0.3, roughness=0.3, specular=0.04)
     photo = radiance_of(make_scene(RIG, block_pattern(64), env, 1.0), maps)
-    found = reconstructor(photo, RIG, block_pattern(64), 1.0, env).lobes.maps
+    found = reconstructor(photo, Lights(RIG, block_pattern(64), env)).lobes.maps
     assert np.abs(found.diffuse - 0.3).mean() < 0.03
     assert np.abs(found.roughness - 0.3).mean() < 0.1
     for k in (1e-9, 1e9):
-        again = reconstructor(photo * k, RIG, block_pattern(64), k, env * k).lobes.maps
+        again = reconstructor(photo * k, Lights(RIG, block_pattern(64), env * k, k)).lobes.maps
         np.testing.assert_allclose(again.roughness, found.roughness)
         np.testing.assert_allclose(again.diffuse, found.diffuse, atol=1e-3)
 
 
 def test_inference_without_a_room_or_with_a_bad_photo(reconstructor):
-    result = reconstructor(np.zeros((8, 8, 3)), RIG, block_pattern(64), 1.0)
+    result = reconstructor(np.zeros((8, 8, 3)), Lights(RIG, block_pattern(64)))
     assert np.isfinite(result.maps.diffuse).all()
     with pytest.raises(InputError, match="photo"):
-        reconstructor(np.zeros((8, 8)), RIG, block_pattern(64), 1.0)
+        reconstructor(np.zeros((8, 8)), Lights(RIG, block_pattern(64)))
 
 
 def test_tiles_cover_and_blend(reconstructor, lights, monkeypatch):

@@ -7,9 +7,9 @@ import pytest
 
 from invrender.data.environments import procedural_environment
 from invrender.data.materials import procedural_material
+from invrender.lights import Lights
 from invrender.maps import constant_maps, map_errors, turn_maps
 from invrender.pattern.default import block_pattern
-from invrender.pipeline import BAKED
 from invrender.refine import gauss_newton as refinement
 from invrender.refine.cautious import correct
 from invrender.refine.checks import baked_light, coarse_error
@@ -17,10 +17,11 @@ from invrender.refine.flat import flat_maps
 from invrender.refine.gauss_newton import Shot, linearise, refine
 from invrender.refine.lobes import fit_lobes, read_lobes
 from invrender.refine.priors import Prior, lobe_prior, network_prior, pooled
-from invrender.refine.several import find_turn, turned_environment, turned_rig
+from invrender.refine.several import find_turn
 from invrender.refine.theta import MIN_ROUGHNESS, to_maps, to_theta
 from invrender.render.fast.estimator import Fast
 from invrender.render.scene import make_scene
+from invrender.report.notices import BAKED
 from invrender.rig import Rig
 from invrender.sphere import scale_environment
 
@@ -222,10 +223,10 @@ def test_two_photos_tell_more_than_one(renderer, environment):
     truth = procedural_material(5, SIZE, SIZE, kind="leather")
     other = PATTERN[::-1, :, ::-1].copy()
     photo = Fast(make_scene(RIG, other, environment, GAIN)).render(turn_maps(truth, 1))
-    turned = make_scene(turned_rig(RIG, -1), other, turned_environment(environment, -1), GAIN)
+    turned = Lights(RIG, other, environment, GAIN).turned(-1)
     shots = [
         Shot(photo_of(truth, environment), renderer),
-        Shot(np.ascontiguousarray(np.rot90(photo, -1)), Fast(turned)),
+        Shot(np.ascontiguousarray(np.rot90(photo, -1)), Fast.under(turned)),
     ]
     # The turned photo is what the turned lights make of the sample that lies as before.
     image, _ = linearise(shots[1].renderer, to_theta(truth), 64)

@@ -16,18 +16,21 @@ from PIL import Image
 from invrender.colour import linear_to_srgb, srgb_to_linear
 from invrender.data.materials import procedural_material
 from invrender.maps import NAMES, Maps
-from invrender.report.page import Report, report_html
+from invrender.report.page import report_html
+from invrender.report.report import Report
 from invrender.rig import Rig
+from invrender.types import Notice
 
 SIZE = 64
 EVIL = '"><script>alert(1)</script><img src=x onerror=alert(2)>'
 REPORT = Report(
+    status="done",
     capture=EVIL, size=SIZE, init="flat", sample_size=0.09,
     seconds={"read": 0.1, "refine": 2.0}, photo_error={"initial": 0.5, "refined": 0.1},
     converged=True, history=[{"seconds": 1.0, "photo_error": 0.2}],
     capture_fit={"ball_centre": [1, 2], "ball_radius": 3, "ball_confidence": 0.9,
                  "gain": [1, 2, 3], "residual": 0.01},
-    warnings=[f"the ball's rim is clipped {EVIL}"],
+    warnings=[Notice("evil", f"the ball's rim is clipped {EVIL}")],
     map_error={k: {n: 0.1 for n in (*NAMES, "average")} for k in ("initial", "refined")},
     versions={"invrender": "0", EVIL: EVIL},
 )  # fmt: skip

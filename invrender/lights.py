@@ -1,0 +1,54 @@
+"""The light on a sample: all that the forward model needs besides the maps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from invrender.rig import Rig
+from invrender.sphere import rotate_environment
+from invrender.types import Array
+
+
+@dataclass(frozen=True)
+class Lights:
+    """The screen's light and the room's, in one unit of radiance (a photo's, where one shows them).
+
+    rig: where screen and camera are. The screen's radiance is ``gain`` (a number or RGB) times
+    ``pattern`` (P, P, 3), relative radiance as the display shows it, row 0 at +y. environment:
+    linear RGB radiance (H, 2H, 3), row 0 at the zenith; zeros, as by default, for a dark room.
+
+    What `invrender.find_lights` adds of a photo's mirror ball. coverage: (H, 2H), the share of each
+    texel of the environment that the ball really shows, the rest is filled in. pattern_captured:
+    (P, P, 3), the screen's radiance as the ball shows it. fit: how well all of it fits, by name:
+    ``residual`` of the pattern relative to the gain, ``gamma`` the exponent on the pattern that
+    fits best (1: as it should be; the gain is for 1), ``blur`` the camera's in pixels, ``pixels``
+    the number used, ``saturated`` and ``room_saturated`` the shares of screen and room in the ball
+    that are saturated, ``room_raised`` how many times brighter the saturated lamps were made,
+    ``hidden_lamp`` how many times brighter than the filling a part of the room behind the screen
+    was made (1: none), ``pattern_residual`` the residual before the screen's pose and curve were
+    fitted, ``screen_shift`` (metres) and ``screen_tilt`` (degrees) how far the screen is found from
+    its place, ``camera_tilt`` how far the camera is found to look past straight down, in degrees.
+
+        lights = Lights(Rig(), default_pattern(), gain=2.0)
+    """
+
+    rig: Rig
+    pattern: Array
+    environment: Array = field(default_factory=lambda: np.zeros((8, 16, 3), np.float32))
+    gain: Any = 1.0
+    coverage: Array | None = None
+    pattern_captured: Array | None = None
+    fit: dict[str, float] = field(default_factory=dict)
+
+    def turned(self, quarters: int) -> Lights:
+        """Seen from a sample that is turned clockwise: all turned counter-clockwise by quarters
+        about its normal. For the forward model alone: the ball stays, and so does ``coverage``."""
+        if quarters % 4 == 0:
+            return self
+        turn = Rotation.from_rotvec([0, 0, 90 * quarters], degrees=True)
+        room = rotate_environment(self.environment, quarters % 4 * np.pi / 2)
+        return replace(self, rig=self.rig.turned(turn, np.zeros(3)), environment=room)

@@ -1,0 +1,138 @@
+"""A result: maps, how sure they are, their light and the photo; kept in a folder."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from invrender.colour import srgb_to_linear
+from invrender.files.images import read_image
+from invrender.files.maps import read_maps, write_maps
+from invrender.files.rig_toml import read_rig, write_rig
+from invrender.files.write import write_exr, write_png
+from invrender.lights import Lights
+from invrender.maps import NAMES, Estimate, Maps
+from invrender.report.report import Report
+from invrender.types import Array, InputError
+
+SAMPLES = 256  # of the specular lobe in the rendering that is kept
+# What is a number in `Report.capture_fit` but of the ball, not of the lights' fit.
+_BALL = ("ball_radius", "ball_confidence")
+
+
+@dataclass(frozen=True)
+class Result:
+    """What `invrender.reconstruct` finds of a sample.
+
+    estimate: the maps and how sure they are. lights: what they were found under, in the photo's
+    unit of radiance. photo: the sample as the photo shows it, (N, N, 3) linear RGB. rendering: the
+    maps under these lights, likewise, where that is at hand. report: what the run measured.
+
+        result = invrender.Result.load("out")
+        relit = result.render(replace(result.lights, environment=room))
+    """
+
+    estimate: Estimate
+    lights: Lights
+    photo: Array
+    report: Report
+    rendering: Array | None = None
+
+    @property
+    def maps(self) -> Maps:
+        """The maps of the estimate."""
+        return self.estimate.maps
+
+    def render(
+        self, lights: Lights | None = None, *, samples: int = SAMPLES, seed: int = 0
+    ) -> Array:
+        """Image (N, N, 3) of the maps, linear RGB radiance, under these lights or others."""
+        from invrender.render.image import render
+
+        return render(self.maps, lights or self.lights, samples=samples, seed=seed)
+
+    def save(self, folder: str | Path) -> None:
+        """Write all of it to a folder (docs: "A result's files"), whole or not at all.
+
+        What else is in the folder stays; a result that is there is replaced, its report last.
+        Raises `InputError` where the folder cannot be written.
+        """
+        out = Path(folder)
+        try:
+            out.parent.mkdir(parents=True, exist_ok=True)
+            place = out if out.exists() else out.parent
+            with tempfile.TemporaryDirectory(dir=place, prefix=".") as name:
+                new = Path(name) / "result"
+                new.mkdir()
+                self._write(new)
+                if not out.exists():
+                    new.rename(out)
+                    return
+                # Without its report a folder is no result: neither the old one nor the new.
+                (out / "report.json").unlink(missing_ok=True)
+                for file in sorted(new.iterdir(), key=lambda f: f.name == "report.json"):
+                    os.replace(file, out / file.name)
+        except OSError as error:
+            raise InputError(f"{out} cannot be written: {error.strerror or error}") from None
+
+    def _write(self, folder: Path) -> None:
+        from invrender.report.page import report_html
+
+        maps, sigma, lights, photo = self.maps, self.estimate.sigma, self.lights, self.photo
+        rendering = self.render() if self.rendering is None else self.rendering
+        screen = lights.pattern_captured
+        if screen is None:
+            screen = lights.pattern * np.asarray(lights.gain, np.float32)
+        write_maps(folder, maps)
+        for key, image in sigma.items():
+            write_exr(folder / f"sigma_{key}.exr", image, data=True)
+        for key, image in maps.encoded().items():
+            write_png(folder / f"{key}.png", image, linear=key in ("normal", "roughness"))
+        write_rig(folder / "rig.toml", lights.rig)
+        write_exr(folder / "environment.exr", lights.environment)
+        write_exr(folder / "pattern_shown.exr", lights.pattern)
+        write_exr(folder / "pattern_captured.exr", screen)
+        if lights.coverage is not None:
+            write_exr(folder / "coverage.exr", lights.coverage)
+        write_exr(folder / "sample.exr", photo)
+        white = max(float(np.percentile(photo, 99.5)), 1e-12)
+        write_png(folder / "photo.png", photo / white)
+        write_png(folder / "render.png", rendering / white)
+        # Grey where they agree; a tenth of white away from black or white.
+        difference = srgb_to_linear(0.5 + 5 * (rendering - photo) / white)
+        write_png(folder / "difference.png", difference)
+        page = report_html(self.report, maps, sigma, lights.environment, screen, photo, rendering)
+        (folder / "report.html").write_text(page, encoding="utf-8")
+        (folder / "report.json").write_text(
+            json.dumps(self.report.to_dict(), indent=2) + "\n", encoding="utf-8"
+        )
+
+    @classmethod
+    def load(cls, folder: str | Path) -> Result:
+        """Read a result that `save` or ``invrender refine`` wrote.
+
+        Raises `InputError` for a folder that holds no whole result, or a damaged one.
+        """
+        folder = Path(folder)
+        report = Report.read(folder)
+        maps = read_maps(folder)
+        sigma = {name: read_image(folder / f"sigma_{name}.exr") for name in NAMES}
+        sigma |= {name: sigma[name][..., 0] for name in ("normal", "roughness")}
+        coverage = folder / "coverage.exr"
+        fit = dict(report.capture_fit)
+        gain = np.asarray(fit.pop("gain"), np.float32)
+        lights = Lights(
+            read_rig(folder / "rig.toml").rig,
+            read_image(folder / "pattern_shown.exr"),
+            read_image(folder / "environment.exr"),
+            gain,
+            read_image(coverage)[..., 0] if coverage.exists() else None,
+            read_image(folder / "pattern_captured.exr"),
+            {k: v for k, v in fit.items() if k not in _BALL and isinstance(v, float)},
+        )
+        return cls(Estimate(maps, sigma), lights, read_image(folder / "sample.exr"), report)
