@@ -15,13 +15,11 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+import invrender
 from invrender.colour import linear_to_srgb
 from invrender.data import EXAMPLE
 from invrender.data.environments import procedural_environment, scale_environment
-from invrender.export import export
-from invrender.files.capture import load_capture
-from invrender.files.maps import read_maps
-from invrender.pipeline import refine_capture
+from invrender.export import export_maps
 from invrender.render.point_lights import relight
 from invrender.sphere import mitsuba_rows
 from invrender.types import Array
@@ -37,15 +35,14 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("-o", "--out", type=Path, default=Path(__file__).with_name("example.jpg"))
     args = parser.parse_args(argv)
-    capture = load_capture(EXAMPLE)
+    capture = invrender.load_capture(EXAMPLE)
+    result = invrender.reconstruct(invrender.find_lights(capture), size=SIDE // 2)
     with tempfile.TemporaryDirectory() as name:
-        result, scene = Path(name) / "result", Path(name) / "scene"
-        refine_capture(EXAMPLE, result, size=SIDE // 2)
-        export(result, scene, "mitsuba", tileable=True)
-        maps, ball = read_maps(result), render_ball(scene)
+        export_maps(result.maps, Path(name) / "scene", "mitsuba", tileable=True)
+        ball = render_ball(Path(name) / "scene")
     lamps = capture.rig.sample_size * np.array(LAMPS)
-    lit = relight(maps, capture.rig, lamps) * np.array(COLOURS)[:, None, None]
-    encoded = maps.encoded()
+    lit = relight(result.maps, capture.rig, lamps) * np.array(COLOURS)[:, None, None]
+    encoded = result.maps.encoded()
     names = ("diffuse", "roughness"), ("normal", "specular")
     linear = ("normal", "roughness")
     shown = {n: image if n in linear else linear_to_srgb(image) for n, image in encoded.items()}

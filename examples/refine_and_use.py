@@ -2,23 +2,20 @@
 
     python examples/refine_and_use.py [CAPTURE] [-o OUT] [--size 256] [--init network]
 
-Every step is one call of the Python API.
+Every step is one call of the Python API; docs/guide/python.md has more.
 """
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+import invrender
 from invrender.data import EXAMPLE
+from invrender.data.environments import procedural_environment
 from invrender.export import export
-from invrender.files.images import read_image
-from invrender.files.maps import read_maps
 from invrender.files.write import write_png
-from invrender.maps import NAMES
-from invrender.pipeline import refine_capture
-from invrender.render.point_lights import relight
-from invrender.rig import Rig
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -30,22 +27,27 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--init", default="network")
     args = parser.parse_args(argv)
 
-    # 1. One photo in, maps out. The folder now holds report.html, too: open it in a browser.
-    report = refine_capture(args.capture, args.out, size=args.size, init=args.init)
-    print(f"photo error {report.photo_error['initial']:.3f} → {report.photo_error['refined']:.3f}")
-    for warning in report.warnings:
-        print("warning:", warning.text)
+    # 1. One photo in: its lights, then its maps. The folder holds report.html: open it.
+    capture = invrender.load_capture(args.capture)
+    found = invrender.find_lights(capture)
+    result = invrender.reconstruct(found, size=args.size, init=args.init)
+    result.save(args.out)
+    for notice in result.report.warnings:
+        print(f"warning ({notice.code}): {notice.text}")
 
     # 2. The maps are plain arrays, row 0 at +y; so is the expected error of each.
-    maps = read_maps(args.out)
-    for name in NAMES:
-        sigma = read_image(args.out / f"sigma_{name}.exr")
-        print(f"{name:>9}: mean {maps.encoded()[name].mean():.3f} ± {np.median(sigma):.3f}")
+    for name, image in result.maps.encoded().items():
+        sigma = np.median(result.estimate.sigma[name])
+        print(f"{name:>9}: mean {image.mean():.3f} ± {sigma:.3f}")
+    if capture.truth is not None:
+        print(
+            "average error:", invrender.evaluate(result.estimate, capture.truth)["maps"]["average"]
+        )
 
-    # 3. Relight the sample: a lamp that the photo never had, low at the left. Metres.
-    rig = Rig()
-    lamp = np.array([[-0.8 * rig.sample_size, 0.0, 0.3 * rig.sample_size]])
-    write_png(args.out / "relit.png", relight(maps, rig, lamp)[0])
+    # 3. The result, read again, in a room that the photo never saw, with the screen switched off.
+    lights = replace(result.lights, environment=procedural_environment(seed=3), gain=0.0)
+    relit = invrender.Result.load(args.out).render(lights)
+    write_png(args.out / "relit.png", relit / np.percentile(relit, 99))
 
     # 4. A file for other programs, with what the conversion costs.
     done = export(args.out, args.out / "material.glb", "gltf")
