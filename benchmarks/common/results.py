@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import platform
 import subprocess
@@ -97,7 +98,7 @@ def write_results(
     about = {"command": " ".join(words), "commit": commit(), "machine": machine()}
     content = {**about, "bars": [], "tables": tables or {}, **results}
     new = out / ".results.json"
-    new.write_text(json.dumps(content, indent=1, default=_plain, allow_nan=True) + "\n")
+    new.write_text(json.dumps(_plain(content), indent=1, allow_nan=False) + "\n")
     os.replace(new, out / "results.json")
     for name, t in (tables or {}).items():
         print(f"\n{name}\n\n{markdown(t)}")
@@ -106,7 +107,13 @@ def write_results(
 
 
 def _plain(value: Any) -> Any:
-    """numpy's numbers and arrays as Python's."""
+    """What JSON can hold: numpy's numbers and arrays as Python's, no value for what is infinite."""
     if hasattr(value, "tolist"):
-        return value.tolist()
-    raise TypeError(f"{type(value).__name__} cannot be written to results.json")
+        value = value.tolist()
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -85,7 +85,10 @@ def filled(text: str, folder: Path = RESULTS) -> str:
             value = look_up(path, folder)
             if isinstance(value, bool) or not isinstance(value, (int, float)):
                 raise InputError(f"{start}: {path} is no number")
-            return f"{start}{value:{form}}<!-- end -->"
+            try:
+                return f"{start}{value:{form}}<!-- end -->"
+            except ValueError:
+                raise InputError(f"{start}: {form!r} is no format of a number") from None
         name, _, which = argument.partition("/")
         if which == "bars":
             found = bars_table(read_results(name, folder)["bars"])

@@ -45,6 +45,16 @@ def test_results_hold_bars_tables_command_and_machine(results):
     assert found["machine"]["versions"]["numpy"] == np.__version__
 
 
+def test_results_are_strict_json(tmp_path):
+    found = {"seconds": np.array([1.5, np.inf]), "n": np.int64(3), "a": (float("nan"), True)}
+    write_results(tmp_path, {**found, "bars": [bar("late", float("inf"), 1, False)]})
+    text = (tmp_path / "results.json").read_text()
+    read = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
+    assert (read["seconds"], read["n"], read["a"]) == ([1.5, None], 3, [None, True])
+    assert read["bars"] == [{"name": "late", "value": None, "bar": 1, "ok": False}]
+    assert "| late |  | 1 | **no** |" in tables.markdown(tables.bars_table(read["bars"]))
+
+
 def test_table_refuses_rows_of_another_length():
     with pytest.raises(ValueError, match="2 cells under 1 columns"):
         table(["a"], [[1, 2]])
@@ -75,6 +85,7 @@ def test_marked_blocks_are_filled_and_stay_so(results):
     ("<!-- table: none/errors --><!-- end -->", "no results 'none'; there are: made"),
     ("<!-- table: made/none --><!-- end -->", "no 'none'; there is: errors"),
     ("<!-- number: .0% made/shares/flat --><!-- end -->", "is no number"),
+    ("<!-- number: x made/shares/flat/better --><!-- end -->", "'x' is no format of a number"),
     ("<!-- table: made/errors -->", "has no <!-- end -->"),
     ("<!-- table: made/errors --><!-- table: made/bars --><!-- end -->", "has no <!-- end -->"),
 ])  # fmt: skip
