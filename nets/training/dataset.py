@@ -5,6 +5,11 @@
 Shards of `SHARD` captures are files shard_NNNNNN.safetensors. Shard i depends on the options, the
 seed and i alone, and appears under its name only when whole: the same command again makes what is
 missing. ``--scheduler`` runs it on a Dask cluster whose machines share the folders.
+
+    python -m nets.training.dataset --out DIR --follow --keep 200 ...
+
+goes on for ever beside a training that reads the folder: a new shard after the newest, and the
+oldest are deleted when there are more than ``--keep``, so no capture is seen for long.
 """
 
 from __future__ import annotations
@@ -13,7 +18,7 @@ import argparse
 import json
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
@@ -35,14 +40,16 @@ from invrender.tasks import map_tasks
 from invrender.types import Array, InputError
 from nets.batch import lobe_inputs, positions
 from nets.clues import light_inputs, white_level
-from nets.predict import estimate_of, linearised, predict
+from nets.predict import estimate_of, linearised
 from nets.store import load_weights
+from nets.tiles import predict
 from nets.training.draw import (
     SPLITS,
     Options,
     draw_environment,
     draw_material,
     draw_rigs,
+    in_fold,
     light_pattern,
 )
 from nets.training.noise import (
@@ -58,6 +65,7 @@ from nets.training.sheet import problems
 Sample = dict[str, Array]
 
 SHARD = 64
+ROUND = 4  # shards a process between two deletions of old ones
 RADIANCE = ("photo", "ideal", "env_clues", "active_clues", "sky", "screen", "ball", "pattern")
 FLOOR = 1e-4  # smallest white level of a usable capture, of the screen's white
 
@@ -167,6 +175,21 @@ def write_shard(folder: Path, index: int, options: Options, count: int = SHARD) 
     return path
 
 
+def next_index(folder: Path) -> int:
+    """The index after the newest shard's."""
+    return max((int(p.stem.removeprefix("shard_")) for p in _shards(folder)), default=-1) + 1
+
+
+def drop_old(folder: Path, keep: int) -> None:
+    """Delete the oldest shards until at most ``keep`` are left."""
+    for path in _shards(folder)[:-keep]:
+        path.unlink(missing_ok=True)
+
+
+def _shards(folder: Path) -> list[Path]:
+    return sorted(Path(folder).glob("shard_*.safetensors"))
+
+
 # --- command line ---------------------------------------------------------------------------------
 
 
@@ -189,6 +212,7 @@ def check_options(options: Options) -> None:
         raise InputError("sizes, samples and captures a room must be positive")
     if not 0 <= options.procedural <= 1:
         raise InputError("--procedural is a share between 0 and 1")
+    in_fold("", options.fold)
     light_pattern(options.pattern)
     if options.network:
         network_cached(options.network)
@@ -198,40 +222,69 @@ def check_options(options: Options) -> None:
         find_environments(Path(options.envs))
 
 
-def main() -> int:
-    """Write what is missing; 1 where a shard failed, 2 for bad input."""
-    parser = argparse.ArgumentParser(prog="python -m nets.training.dataset", description=__doc__)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--count", type=int, default=4096, help="captures")
-    parser.add_argument("--first", type=int, default=0, help="index of the first shard")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes")
-    parser.add_argument("--scheduler", help="address of a Dask scheduler, instead of processes")
+def parser() -> argparse.ArgumentParser:
+    p = argparse.ArgumentParser(prog="python -m nets.training.dataset", description=__doc__)
+    p.add_argument("--out", type=Path, required=True)
+    p.add_argument("--count", type=int, default=4096, help="captures")
+    p.add_argument("--first", type=int, default=0, help="index of the first shard")
+    p.add_argument("--follow", action="store_true", help="go on for ever, after the newest shard")
+    p.add_argument("--keep", type=int, default=200, help="shards to keep with --follow")
+    p.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes")
+    p.add_argument("--scheduler", help="address of a Dask scheduler, instead of processes")
     for name, value in asdict(Options()).items():
         kind = {"choices": SPLITS} if name == "split" else {"type": type(value)}
-        parser.add_argument(f"--{name.replace('_', '-')}", default=value, **kind)
-    args = parser.parse_args()
+        p.add_argument(f"--{name.replace('_', '-')}", default=value, **kind)
+    return p
+
+
+def write_shards(
+    args: argparse.Namespace, options: Options, first: int, counts: Sequence[int]
+) -> int:
+    """Write the shards from ``first`` on that are missing, of so many captures each; how many
+    failed."""
+    jobs = [(args.out.resolve(), first + i, options, n) for i, n in enumerate(counts)]
+    jobs = [job for job in jobs if not shard_path(*job[:2]).exists()]
+    start, made, failed = time.perf_counter(), 0, 0
+    for done in map_tasks(_work, jobs, args.scheduler, args.workers):
+        if done.error is not None:
+            failed += 1
+            print(f"shard {jobs[done.index][1]} failed: {done.error}\n{done.trace}", flush=True)
+            continue
+        index, seconds = done.result
+        made += jobs[done.index][3]
+        rate = made / (time.perf_counter() - start)
+        print(f"shard {index}: {seconds:.1f} s; {rate:.2f} captures/s in all", flush=True)
+    return failed
+
+
+def follow(args: argparse.Namespace, options: Options) -> None:
+    """Write shards after the newest one until interrupted, and keep the newest ``args.keep``. Stops
+    where a whole round of shards fails."""
+    while True:
+        counts = [SHARD] * (ROUND * args.workers)
+        if write_shards(args, options, next_index(args.out), counts) == len(counts):
+            raise InputError("no shard could be written; see above")
+        drop_old(args.out, args.keep)
+
+
+def main() -> int:
+    """Write what is missing; 1 where a shard failed, 2 for bad input, 130 for Ctrl-C."""
+    args = parser().parse_args()
     options = Options(**{k: getattr(args, k) for k in asdict(Options())})
-    failed = 0
     try:
+        if args.keep < 1 or args.workers < 1:
+            raise InputError("--keep and --workers must be at least 1")
         check_options(options)
         args.out.mkdir(parents=True, exist_ok=True)
+        if args.follow:
+            follow(args, options)
         counts = [min(SHARD, args.count - i) for i in range(0, args.count, SHARD)]
-        jobs = [(args.out.resolve(), args.first + i, options, n) for i, n in enumerate(counts)]
-        jobs = [job for job in jobs if not shard_path(*job[:2]).exists()]
-        start, made = time.perf_counter(), 0
-        for done in map_tasks(_work, jobs, args.scheduler, args.workers):
-            if done.error is not None:
-                failed += 1
-                print(f"shard {jobs[done.index][1]} failed: {done.error}\n{done.trace}", flush=True)
-                continue
-            index, seconds = done.result
-            made += jobs[done.index][3]
-            rate = made / (time.perf_counter() - start)
-            print(f"shard {index}: {seconds:.1f} s; {rate:.2f} captures/s in all", flush=True)
+        return 1 if write_shards(args, options, args.first, counts) else 0
     except InputError as e:
         print(f"error: {e}")
         return 2
-    return 1 if failed else 0
+    except KeyboardInterrupt:
+        return 130
 
 
 if __name__ == "__main__":

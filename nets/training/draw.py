@@ -7,6 +7,8 @@ training sees.
 from __future__ import annotations
 
 import logging
+import re
+import zlib
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -15,7 +17,14 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from invrender.data.environments import find_environments, procedural_environment, read_environment
-from invrender.data.materials import augment, check_maps, load_materials, mix, procedural_material
+from invrender.data.materials import (
+    RARE,
+    augment,
+    check_maps,
+    load_materials,
+    mix,
+    procedural_material,
+)
 from invrender.files.images import read_image
 from invrender.maps import Maps
 from invrender.pattern.default import default_pattern
@@ -26,15 +35,18 @@ from nets.splitsum import area_resize
 
 log = logging.getLogger("invrender")
 
-# Share of real materials with the relief and the roughness of others: there are few, and a network
-# learns them by heart.
-CROSSED = 0.3
+# Chosen by hand, for training alone. Share of real materials with the relief and the roughness of
+# others: there are few, and a network learns them by heart. Share of made-up materials that are of
+# the kinds of which there are few real ones. Share of materials that are two mixed.
+CROSSED, RARE_SHARE, MIXED_SHARE = 0.3, 0.35, 0.1
 
 # Materials and rooms of the two validation sets, by split.
 HELD_OUT = {
     split: Path(__file__).with_name(f"{name}.txt")
     for split, name in (("holdout", "holdout"), ("families", "holdout_families"))
 }
+LARGEST = 512  # pixels a side of a real material, larger ones are shrunk to it
+
 SPLITS = ("train", *HELD_OUT)
 
 
@@ -46,7 +58,8 @@ class Options:
     procedural: share of made-up materials and rooms where folders are given. per_room: captures in
     the same room with the same rig. pattern: an image file, or the default pattern where empty.
     network: weights; where given, captures are not for that network but for the correction of its
-    maps (`nets.correction`).
+    maps (`nets.correction`). fold: "K/N", for cross-fitting: of N parts into which the training
+    materials fall by family, only part K; "-K/N", all but part K.
     """
 
     size: int = 128
@@ -60,6 +73,7 @@ class Options:
     env_height: int = 64
     pattern: str = ""
     network: str = ""
+    fold: str = ""
 
 
 @lru_cache(maxsize=2)
@@ -83,12 +97,35 @@ def belongs(name: str, split: str) -> bool:
     return name in held_out(split)
 
 
+def family(name: str) -> str:
+    """Materials whose names differ only in trailing numbers and variants, such as acg_Bricks056 and
+    acg_Bricks057, are of one family: acg_bricks."""
+    return re.sub(r"[\W_]*\d.*$", "", name).lower() or name.lower()
+
+
+def in_fold(name: str, fold: str) -> bool:
+    """Whether a material is drawn in a fold ("K/N", "-K/N" for the rest, "" for all). Families stay
+    whole; which part one falls in depends on its name alone. Raises `InputError`."""
+    if not fold:
+        return True
+    match = re.fullmatch(r"(-?)(\d+)/(\d+)", fold)
+    part, parts = (int(match[2]), int(match[3])) if match else (0, 0)
+    if match is None or not 1 <= part <= parts:
+        raise InputError(f"a fold is K/N or -K/N with K from 1 to N, got {fold!r}")
+    mine = zlib.crc32(family(name).encode()) % parts == part - 1
+    return mine != bool(match[1])
+
+
 @lru_cache(maxsize=4)
-def _folder_materials(root: str, split: str) -> tuple[Maps, ...]:
-    """Usable materials of a folder that belong to a split, at most 512² each."""
+def _folder_materials(root: str, split: str, fold: str = "") -> tuple[Maps, ...]:
+    """Usable materials of a folder that belong to a split and a fold, at most 512² each."""
     if not root:
         return ()
-    found = load_materials(Path(root), 512, lambda folder: belongs(folder.name, split))
+
+    def wanted(folder: Path) -> bool:
+        return belongs(folder.name, split) and in_fold(folder.name, fold)
+
+    found = load_materials(Path(root), LARGEST, wanted)
     return tuple(maps for _, maps in found)
 
 
@@ -107,24 +144,32 @@ def _folder_environments(root: str, split: str, height: int) -> tuple[Array, ...
 
 def draw_material(rng: np.random.Generator, options: Options) -> Maps:
     """A material of size × size, procedural or from the folder, at times two mixed."""
-    real = _folder_materials(options.materials, options.split)
+    real = _folder_materials(options.materials, options.split, options.fold)
     n = options.size
 
+    training = options.split == "train"
+
     def piece() -> Maps:
-        jitter = 1.0 if options.split == "train" else 0.0
+        jitter = 1.0 if training else 0.0
         return augment(real[rng.integers(len(real))], rng, n, n, jitter=jitter)
+
+    def made_up() -> Maps:
+        kind = None
+        if training and rng.random() < RARE_SHARE:
+            kind = RARE[rng.integers(len(RARE))]
+        return procedural_material(int(rng.integers(2**62)), n, n, kind)
 
     def one() -> Maps:
         if not real or rng.random() < options.procedural:
-            return procedural_material(int(rng.integers(2**62)), n, n)
+            return made_up()
         maps = piece()
-        if options.split == "train" and rng.random() < CROSSED:
+        if training and rng.random() < CROSSED:
             maps = replace(maps, normal=piece().normal, roughness=piece().roughness)
         return maps
 
     for _ in range(20):
         maps = one()
-        if options.split == "train" and rng.random() < 0.1 and n >= 8:
+        if training and rng.random() < MIXED_SHARE and n >= 8:
             field = gaussian_filter(
                 rng.standard_normal((n, n)), n / rng.uniform(4, 16), mode="wrap"
             )

@@ -38,7 +38,7 @@ def count(path: Path) -> int:
 _keep = cache(load_file)
 
 
-def _load(paths: Sequence[Path], device: torch.device) -> Batch:
+def load_shards(paths: Sequence[Path], device: torch.device) -> Batch:
     """The captures of some shards, one after another. A GPU keeps every shard that it has seen."""
     load = _keep if device.type == "cuda" else load_file
     parts = [load(path, str(device)) for path in paths]
@@ -77,7 +77,7 @@ def _cut(
 
 def read_batch(path: Path, batch: int, device: torch.device = CPU) -> Iterator[Batch]:
     """A shard's captures in order, whole."""
-    captures = _load([path], device)
+    captures = load_shards([path], device)
     n = len(captures["photo"])
     for start in range(0, n, batch):
         yield _cut(captures, range(start, min(start + batch, n)))
@@ -95,7 +95,8 @@ def batches(
 ) -> Iterator[Batch]:
     """Endless random crops, from step ``start`` on; each of ``world`` processes gets its own part.
 
-    An epoch is made of what the folder holds when it begins, so shards may be added meanwhile.
+    An epoch is made of what the folder holds when it begins, so shards may be added meanwhile;
+    those that are deleted meanwhile are left out.
     """
     step, epoch = 0, 0
     while True:
@@ -103,7 +104,7 @@ def batches(
         paths = shards(folder)
         order = [paths[i] for i in rng.permutation(len(paths))]
         for at in range(0, len(order), GROUP):
-            group = order[at : at + GROUP]
+            group = [p for p in order[at : at + GROUP] if p.exists()]
             members = rng.permutation(sum(count(p) for p in group))
             corners = rng.random((len(members), 2))
             captures: Batch = {}
@@ -111,7 +112,10 @@ def batches(
                 step += 1
                 if step <= start:
                     continue
-                captures = captures or _load(group, device)
+                try:
+                    captures = captures or load_shards(group, device)
+                except FileNotFoundError:  # deleted since the group was formed
+                    break
                 mine = slice(k + rank * batch, k + (rank + 1) * batch)
                 yield _cut(captures, members[mine], corners[mine], crop)
         if step == 0:

@@ -2,8 +2,12 @@
 
     python -m nets.training.sheet --data DIR --out sheet.png [--count 24]
 
-Reads all shards of a folder, prints how photos and maps are distributed and every degenerate
-capture with the reason, and draws a row each for captures from all over the folder.
+    python -m nets.training.sheet --kinds leather foam ... --out sheet.png [--count 6]
+
+The first reads all shards of a folder, prints how photos and maps are distributed and every
+degenerate capture with the reason, and draws a row each for captures from all over the folder. The
+second draws a row for each kind of procedural material (``all``: every kind), ``--count`` examples
+side by side under lamps.
 """
 
 from __future__ import annotations
@@ -18,12 +22,15 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import load_file
 
+from invrender.data.materials import PRESETS, procedural_material
+from invrender.render.point_lights import rerender
 from invrender.types import InputError
 from nets.clues import ALBEDO, WHITE
 
 Array = NDArray[Any]
 Sample = dict[str, Array]
 
+KIND_SIZE = 128  # pixels a side of a procedural material on a sheet
 BLACK = 1e-3  # of a white plane's radiance: a photo whose 99th percentile is below shows nothing
 CLIPPED = 0.5  # largest share of pixels at the sensor's limit
 FLAT = 1e-4  # least standard deviation of a photo, of its mean
@@ -133,6 +140,30 @@ def draw(rows: list[tuple[str, Sample]], out: Path) -> None:
     plt.close(figure)
 
 
+def draw_kinds(kinds: list[str], count: int, out: Path) -> None:
+    """Write a sheet of procedural materials as they look from above under nine lamps, each beside
+    its normals. Raises `InputError` for an unknown kind."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(
+        len(kinds), count, figsize=(2.6 * count, 1.4 * len(kinds)), squeeze=False
+    )
+    for line, kind in zip(axes, kinds, strict=True):
+        for seed, ax in enumerate(line):
+            maps = procedural_material(seed, KIND_SIZE, KIND_SIZE, kind)
+            parts = [rerender(maps).mean(0), maps.normal / 2 + 0.5]
+            ax.imshow(np.concatenate(parts, 1).clip(0, 1), interpolation="nearest")
+            ax.set_xticks([])
+            ax.set_yticks([])
+        line[0].set_ylabel(kind, fontsize=7)
+    figure.tight_layout(pad=0.2)
+    figure.savefig(out, dpi=80)
+    plt.close(figure)
+
+
 def inspect(folder: Path, count: int) -> tuple[list[tuple[str, Sample]], str, int]:
     """(captures for the sheet, a report, how many are degenerate) of a folder of shards."""
     shown: list[tuple[str, Sample]] = []
@@ -162,12 +193,18 @@ def inspect(folder: Path, count: int) -> tuple[list[tuple[str, Sample]], str, in
 def main() -> int:
     """Report and sheet; 1 where a capture is degenerate, 2 for bad input."""
     parser = argparse.ArgumentParser(prog="python -m nets.training.sheet", description=__doc__)
-    parser.add_argument("--data", type=Path, required=True, help="folder of shards")
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("--data", type=Path, help="folder of shards")
+    what.add_argument("--kinds", nargs="+", help="procedural materials, or all")
     parser.add_argument("--out", type=Path, required=True, help="PNG of the contact sheet")
-    parser.add_argument("--count", type=int, default=24, help="captures on the sheet")
+    parser.add_argument("--count", type=int, help="captures on the sheet (24), or of a kind (6)")
     args = parser.parse_args()
     try:
-        shown, report, bad = inspect(args.data, args.count)
+        if args.kinds:
+            kinds = list(PRESETS) if args.kinds == ["all"] else args.kinds
+            draw_kinds(kinds, args.count or 6, args.out)
+            return 0
+        shown, report, bad = inspect(args.data, args.count or 24)
     except InputError as e:
         print(f"error: {e}")
         return 2

@@ -273,17 +273,21 @@ def run(
             means = {k: float(v) / max(count, 1) for k, v in sums.items()}
             row = {"step": trainer.step, "seconds": trainer.seconds, "skipped": trainer.skipped}
             row |= {f"train_{k}": v for k, v in means.items()}
-            for name, folder in valid.items():
-                mean = trainer.mean.module
-                assert isinstance(mean, Network | Correction)
-                result = validate(mean, folder, trainer.device, limit=args.valid_count)
-                row |= {f"{name}_{k}": v for k, v in result.items()}
+            row |= errors_of(trainer, valid, args.valid_count)
             append_log(args.out / "log.csv", row)
             trainer.save({"hours": trainer.seconds / 3600, **row})
             shown = {k: v for k, v in row.items() if "coverage_" not in k}
             print(" ".join(f"{k} {v:.4g}" for k, v in shown.items()), flush=True)
             plot_log(args.out / "log.csv", args.out / "curve.png")
         sums, count, start = {}, 0, time.perf_counter()
+
+
+def errors_of(trainer: Trainer, valid: dict[str, Path], limit: int) -> dict[str, float]:
+    """`validate` the mean weights on folders by name, the keys prefixed with the names."""
+    mean = trainer.mean.module
+    assert isinstance(mean, Network | Correction)
+    results = {k: validate(mean, v, trainer.device, limit=limit) for k, v in valid.items()}
+    return {f"{name}_{k}": v for name, result in results.items() for k, v in result.items()}
 
 
 def append_log(path: Path, row: dict[str, float]) -> None:

@@ -9,12 +9,13 @@ from invrender.data.materials.files import (
     read_material,
 )
 from invrender.data.materials.patterns import normals_from_height
-from invrender.data.materials.procedural import PRESETS, procedural_material
+from invrender.data.materials.procedural import PRESETS, RARE, procedural_material
 from invrender.maps import crop_maps, resize_maps, rotate_maps, turn_maps, unit_normals
 from invrender.sampling import resize
 
 __all__ = [
     "PRESETS",
+    "RARE",
     "augment",
     "check_maps",
     "crop_maps",

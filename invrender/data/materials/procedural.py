@@ -43,7 +43,8 @@ def _plain(canvas: Canvas, rng: np.random.Generator) -> Layers:
     )
 
 
-# Every kind and how often it is drawn.
+# Every kind and how often it is drawn; those of weight 0 only by name, so that what a seed draws
+# stays the same.
 PRESETS: dict[str, tuple[Kind, float]] = {
     "bricks": (hard.bricks, 1.0),
     "tiles": (hard.tiles, 1.2),
@@ -71,7 +72,16 @@ PRESETS: dict[str, tuple[Kind, float]] = {
     "painted_metal": (metals.painted_metal, 0.9),
     "corrugated_metal": (metals.corrugated_metal, 0.3),
     "patches": (_plain, 1.0),
+    "foam": (soft.foam, 0.0),
+    "cardboard": (soft.cardboard, 0.0),
+    "skin": (soft.skin, 0.0),
 }
+
+# Kinds of which collections of real materials hold few.
+RARE = (
+    "plastic", "paper", "cardboard", "leather", "skin", "rubber", "foam", "painted_metal",
+    "brushed_metal",
+)  # fmt: skip
 
 
 def procedural_material(

@@ -1,4 +1,4 @@
-"""Procedural cloth, leather, wood, paper, plastic and rubber."""
+"""Procedural cloth, leather, skin, wood, paper, cardboard, plastic, rubber and foam."""
 
 from __future__ import annotations
 
@@ -313,3 +313,72 @@ def rubber(canvas: Canvas, rng: Rng) -> Layers:
     return Layers(
         tone, height, uniform(rng, 0.4, 0.85) + 0.25 * dust + 0.03 * level, relief=(2, 35)
     )
+
+
+def foam(canvas: Canvas, rng: Rng) -> Layers:
+    """Open cells like a sponge, or closed ones under a thin skin like packing foam."""
+    base = grey(rng, (0.03, 0.8)) if chance(rng, 0.5) else dye(rng, (0.05, 0.8))
+    f = log_uniform(rng, 12, 50)
+    cells = voronoi(canvas, rng, f, uniform(rng, 0.6, 1.0))
+    wall = cells.inside * np.float32(f)  # distance from the walls, in cells
+    size = np.float32(0.6) + np.float32(0.8) * cells.values(rng)
+    if chance(rng, 0.5):  # open
+        hole = smoothstep(0.08, 0.3, wall * size) * (cells.values(rng) > uniform(rng, 0.0, 0.4))
+        small = smoothstep(0.1, 0.35, voronoi(canvas, rng, 2.7 * f).inside * np.float32(2.7 * f))
+        height = -(hole + 0.25 * small) / np.float32(2.5 * f)
+        tone = base * (1 - uniform(rng, 0.4, 0.8) * hole - 0.15 * small)[..., None]
+        return Layers(tone, height, uniform(rng, 0.75, 1.0), relief=(15, 48))
+    dome = smoothstep(0.0, 0.45, wall * size)
+    height = dome / np.float32(6 * f) + bumps(canvas, rng, 2, 0.04, 3)
+    tone = base * (0.8 + 0.2 * dome)[..., None]
+    rough = uniform(rng, 0.4, 0.8) + 0.1 * (1 - dome)
+    return Layers(tone, height, rough, relief=(3, 18))
+
+
+def cardboard(canvas: Canvas, rng: Rng) -> Layers:
+    """Kraft or grey board: fibres and specks, flutes that show through, creases, print."""
+    kraft = colour(rng, (0.07, 0.1), (0.4, 0.6), (0.25, 0.45))
+    base = kraft if chance(rng, 0.75) else grey(rng, (0.25, 0.8))
+    angle = float(rng.integers(2)) * np.pi / 2 if chance(rng, 0.7) else uniform(rng, 0, np.pi)
+    along = canvas.turned(angle)
+    fibre = noise(canvas, rng, (20, 90), 2, 0.8, at=along)
+    speck = smoothstep(1.6, 2.6, noise(canvas, rng, 60, 2, 0.8))
+    tone = base * np.exp(0.06 * fibre + 0.05 * noise(canvas, rng, 3, 4))[..., None]
+    tone = mixed(tone, base * np.float32(0.4), speck * np.float32(uniform(rng, 0.1, 0.6)))
+    height = bumps(canvas, rng, 40, 0.02, 2, 0.7)
+    rough = uniform(rng, 0.65, 0.95) + 0.03 * fibre
+    if chance(rng, 0.65):  # flutes under the liner
+        f = uniform(rng, 10, 32)
+        flute = np.cos(along[0] * np.float32(2 * np.pi * f) + 0.3 * noise(canvas, rng, 3, 2))
+        height = height + flute * np.float32(uniform(rng, 0.01, 0.08) / f)
+        tone = tone * (1 + uniform(rng, 0.0, 0.06) * flute)[..., None]
+    if chance(rng, 0.35):  # folds, whose fibres are broken and pale
+        lines = brick_cells(rng, along, 1 / uniform(rng, 1, 2.5), 1 / uniform(rng, 1, 2.5), 0.1)
+        fold = smoothstep(0.012, 0.0, lines.inside)
+        height = height - fold * np.float32(0.004)
+        tone = mixed(tone, base * np.float32(1.3), fold * np.float32(0.4))
+    if chance(rng, 0.4):
+        tone, _ = printed(canvas, rng, tone)
+    return Layers(tone, height, rough, f0=0.04, relief=(0.5, 10))
+
+
+def skin(canvas: Canvas, rng: Rng) -> Layers:
+    """Like human skin: furrows that cross in triangles, pores, blotches, a moist sheen."""
+    base = colour(rng, (0.025, 0.075), (0.3, 0.65), (0.04, 0.65))
+    f = log_uniform(rng, 14, 45)
+    points = warped(canvas, rng, f / 4, 0.2 / f)
+    plates = voronoi(canvas, rng, f, 0.9, at=points)
+    fine = voronoi(canvas, rng, 2.1 * f, 1.0, at=points)
+    furrow = smoothstep(0.16, 0.0, plates.inside * np.float32(f))
+    furrow = np.maximum(furrow, 0.5 * smoothstep(0.14, 0.0, fine.inside * np.float32(2.1 * f)))
+    pits = voronoi(canvas, rng, f / 2)
+    pore = smoothstep(0.1, 0.03, np.hypot(pits.x, pits.y) * np.float32(f / 2))
+    blood = smoothstep(-1.5, 2.0, noise(canvas, rng, log_uniform(rng, 2, 8), 4))
+    red = base * np.array([1.0, 0.72, 0.68], np.float32)
+    tone = mixed(base, red, blood) * (1 - 0.12 * furrow - 0.25 * pore)[..., None]
+    if chance(rng, 0.4):  # moles and freckles
+        spot = smoothstep(1.3, 2.0, noise(canvas, rng, log_uniform(rng, 5, 14), 2))
+        tone = mixed(tone, base * np.array([0.45, 0.35, 0.3], np.float32), spot)
+    rough = uniform(rng, 0.3, 0.55) + 0.15 * furrow + 0.04 * noise(canvas, rng, 6, 3)
+    height = -(furrow + 0.8 * pore) * np.float32(0.25 / f) + bumps(canvas, rng, 3, 0.05, 3)
+    return Layers(tone, height, rough, f0=0.028, relief=(2, 16))

@@ -19,7 +19,8 @@ from invrender.rig import Rig  # noqa: E402
 from invrender.sampling import resize  # noqa: E402
 from nets.batch import positions  # noqa: E402
 from nets.correction import ALBEDO_CORRELATION, INPUTS, NOISE, Correction, features, gauss_newton  # noqa: E402
-from nets.predict import Corrector, Prediction, linearised  # noqa: E402
+from nets.predict import Corrector, linearised  # noqa: E402
+from nets.scales import Prediction  # noqa: E402
 from nets.store import build, load_weights, save_weights  # noqa: E402
 
 SIZE = 12
@@ -240,8 +241,8 @@ def test_no_normal_points_below_the_surface(lit, monkeypatch):
 
 
 def test_an_interrupted_run_leaves_the_best_and_goes_on(tmp_path, monkeypatch):
-    monkeypatch.setattr("nets.predict.TILE", 16)
-    monkeypatch.setattr("nets.predict.OVERLAP", 4)
+    monkeypatch.setattr("nets.tiles.TILE", 16)
+    monkeypatch.setattr("nets.tiles.OVERLAP", 4)
     forward = Correction.forward
 
     def stops(self, batch):

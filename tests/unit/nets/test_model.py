@@ -28,8 +28,9 @@ from nets.batch import (  # noqa: E402
 )
 from nets.blocks import NAFBlock, Upsample, pad_to  # noqa: E402
 from nets.model import DIELECTRIC_F0, Network, normalise  # noqa: E402
-from nets.predict import WEIGHTS, Reconstructor, _tiles, predict  # noqa: E402
+from nets.predict import WEIGHTS, Reconstructor  # noqa: E402
 from nets.store import build, load_weights, save_weights  # noqa: E402
+from nets.tiles import _tiles, predict  # noqa: E402
 
 RIG = Rig()
 UNITLESS = ("position", "rig", "lobes", "evidence", "costs")
@@ -464,8 +465,8 @@ def test_inference_without_a_room_or_with_a_bad_photo(reconstructor):
 
 
 def test_tiles_cover_and_blend(reconstructor, lights, monkeypatch):
-    monkeypatch.setattr("nets.predict.TILE", 64)
-    monkeypatch.setattr("nets.predict.OVERLAP", 16)
+    monkeypatch.setattr("nets.tiles.TILE", 64)
+    monkeypatch.setattr("nets.tiles.OVERLAP", 16)
     covered = np.zeros((100, 150), int)
     for rows, columns in _tiles(100, 150):
         covered[rows, columns] += 1

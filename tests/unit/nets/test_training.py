@@ -1,5 +1,6 @@
 import csv
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ torch = pytest.importorskip("torch")
 
 from safetensors.numpy import load_file, save_file  # noqa: E402
 
+from invrender.data.materials import augment  # noqa: E402
 from invrender.files.maps import write_maps  # noqa: E402
 from invrender.files.write import write_exr  # noqa: E402
 from invrender.maps import constant_maps  # noqa: E402
@@ -19,7 +21,7 @@ from nets.batch import positions  # noqa: E402
 from nets.model import MAPS  # noqa: E402
 from nets.store import build, load_weights  # noqa: E402
 from nets.training import dataset as data  # noqa: E402
-from nets.training import draw, sheet, train  # noqa: E402
+from nets.training import draw, gpu, sheet, train  # noqa: E402
 from nets.training.calibrate import calibrate  # noqa: E402
 from nets.training.loader import batches, read_batch, shards  # noqa: E402
 from nets.training.loss import SPREAD, compare, total_loss, truth  # noqa: E402
@@ -114,11 +116,44 @@ def test_command_makes_what_is_missing(tmp_path, monkeypatch, capsys):
         (("--pattern", "nowhere.png"), "nowhere.png"),
         (("--procedural", 2), "share"),
         (("--size", 0), "positive"),
+        (("--fold", "3/2"), "fold"),
+        (("--follow", "--keep", 0), "--keep"),
     ],
 )
 def test_command_refuses_bad_input_before_it_starts(words, why, tmp_path, monkeypatch, capsys):
     assert command(monkeypatch, "--out", tmp_path / "new", *SMALL, *words) == 2
     assert why in capsys.readouterr().out and not (tmp_path / "new").exists()
+
+
+def test_following_never_ends_and_bounds_the_disk(tmp_path, monkeypatch):
+    """Always new shards after the newest, and of the old ones at most so many."""
+    monkeypatch.setattr(data, "_single_thread", lambda: None)
+    monkeypatch.setattr(data, "SHARD", 1)
+    monkeypatch.setattr(data, "ROUND", 2)
+    rounds, drop_old = [], data.drop_old
+
+    def until_three_rounds(folder, keep):
+        drop_old(folder, keep)
+        rounds.append([int(p.stem[-6:]) for p in shards(folder)])
+        if len(rounds) == 3:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(data, "drop_old", until_three_rounds)
+    assert command(monkeypatch, "--out", tmp_path, "--follow", "--keep", 3, *SMALL) == 130
+    assert rounds == [[0, 1], [1, 2, 3], [3, 4, 5]]
+    assert data.next_index(tmp_path) == 6 and not list(tmp_path.glob("*.part"))
+
+
+def test_a_trainer_goes_on_when_shards_are_dropped(folder, tmp_path):
+    for path in shards(folder):
+        shutil.copy(path, tmp_path)
+    stream = batches(tmp_path, 2, 8, 0)
+    next(stream)
+    data.drop_old(tmp_path, 1)
+    (left,) = shards(tmp_path)
+    later = [next(stream)["photo"] for _ in range(12)][-3:]  # of the next epochs
+    whole = torch.cat([b["photo"] for b in read_batch(left, 6)])
+    assert all(torch.isin(p, whole).all() for p in later)
 
 
 @pytest.mark.slow
@@ -172,6 +207,33 @@ def test_held_out_names_are_kept_apart(tmp_path):
     assert len(old) == 24 and len(new) == 33 and not old & new
 
 
+def test_folds_part_the_families():
+    names = [
+        f"acg_{kind}{i:03d}" for kind in ("Wood", "Bricks", "Metal", "Tiles") for i in range(9)
+    ]
+    names += ["ph_rock_wall_08", "ph_rock_wall_02", "moss", "acg_Wallpaper001A"]
+    one, two, rest = ({n for n in names if draw.in_fold(n, f)} for f in ("1/2", "2/2", "-1/2"))
+    assert one | two == set(names) and not one & two and rest == two and one and two
+    assert {draw.family(n) for n in one}.isdisjoint(draw.family(n) for n in two)
+    assert draw.family("ph_rock_wall_08") == draw.family("ph_rock_wall_02") == "ph_rock_wall"
+    assert all(draw.in_fold(n, "") for n in names)
+    for bad in ("3/2", "0/2", "1", "a/b"):
+        with pytest.raises(InputError, match="fold"):
+            draw.in_fold("moss", bad)
+
+
+def test_pieces_of_a_material_are_of_every_scale_and_never_enlarged():
+    """A ramp's slope tells how many source pixels a pixel holds."""
+    rng = np.random.default_rng(0)
+    maps = constant_maps(256, 256, diffuse=0.5)
+    maps.roughness = np.tile(np.linspace(0.1, 0.9, 256, dtype=np.float32), (256, 1))
+    steps = []
+    for _ in range(60):
+        r = augment(maps, rng, 32, 32, jitter=0, free_rotation=0).roughness
+        steps.append(max(np.ptp(r[:, 16]), np.ptp(r[16])) / (0.8 / 255) / 31)
+    assert min(steps) > 0.99 and min(steps) < 1.5 and max(steps) > 5
+
+
 def test_display_and_sensor_noise_are_small_and_seeded():
     rng = np.random.default_rng(0)
     pattern = block_pattern(32)
@@ -221,6 +283,12 @@ def test_sheet_reports_and_draws(folder, tmp_path, monkeypatch, capsys):
     assert sheet.main() == 1
     assert "shard_000000[5]: the photo is black" in capsys.readouterr().out
     monkeypatch.setattr("sys.argv", ["s", "--data", str(tmp_path), "--out", str(out)])
+    assert sheet.main() == 2
+    kinds = tmp_path / "kinds.png"
+    words = ["s", "--kinds", "foam", "skin", "--count", "2", "--out", str(kinds)]
+    monkeypatch.setattr("sys.argv", words)
+    assert sheet.main() == 0 and kinds.stat().st_size > 1000
+    monkeypatch.setattr("sys.argv", [*words[:2], "cheese", *words[4:]])
     assert sheet.main() == 2
 
 
@@ -361,3 +429,32 @@ def test_calibration_and_baseline(folder):
             assert again[f"coverage_{k}"] == pytest.approx(0.68, abs=0.03)
     guess = train.baseline(folder)
     assert 0.02 < guess["normal"] < 0.3 and 0.02 < guess["diffuse"] < 0.4
+
+
+def test_a_loan_of_some_minutes_draws_and_trains(folder, tmp_path):
+    """The GPU's script on a CPU, for three seconds: new captures, steps, weights and two rows."""
+    words = ["--minutes", 0.05, "--out", tmp_path, "--data", folder, "--valid", f"val={folder}"]
+    words += ["--preset", "tiny", "--size", 16, "--batch", 4, "--valid-count", 4]
+    args = gpu.parser().parse_args([str(w) for w in words])
+    args.weights = None
+    trainer = gpu.train(args)
+    with open(tmp_path / "log.csv", newline="") as f:
+        first, last = csv.DictReader(f)
+    assert first["step"] == "0" and int(last["step"]) == trainer.step > 0
+    assert int(last["drawn"]) >= 0 and float(last["val_average"]) > 0
+    assert load_weights(tmp_path / "weights.safetensors")[1]["step"] == trainer.step
+
+
+def test_the_pool_keeps_the_newest_captures():
+    pool = gpu.Pool(torch.device("cpu"), size=4)
+    pool.stop.set()
+    pool.draw(OPTIONS)
+    assert pool.drawn == len(pool.samples) == 1 and not pool.failed
+    for _ in range(5):
+        pool.add({k: v.numpy() for k, v in pool.samples[0].items()})
+    batch = pool.batch(np.random.default_rng(0), 3)
+    assert len(pool.samples) == 4 and batch["photo"].shape == (3, 3, 16, 16)
+    assert batch["position"].shape == (3, 2, 16, 16) and batch["maps"].dtype == torch.uint8
+    pool.draw(replace(OPTIONS, materials="nowhere"))
+    with pytest.raises(InputError, match="nowhere"):
+        pool.batch(np.random.default_rng(0), 1)

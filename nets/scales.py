@@ -1,0 +1,74 @@
+"""An estimate at one size with the large shades of another: what a network was trained to judge at
+small sizes it judges at those."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from invrender.maps import NAMES, Estimate, Maps, resize_maps, unit_normals
+from invrender.refine.lobes import Lobes
+from invrender.sampling import resize
+from invrender.types import Array
+from nets.model import MIN_ROUGHNESS
+
+WHOLE = 256  # pixels of the longer side at which a sample is judged as a whole
+COARSE = 128  # pixels of the longer side at which the correction was trained
+
+
+@dataclass(frozen=True)
+class Prediction(Estimate):
+    """What a network estimates of a photo; where that says nothing the deviations are large.
+
+    unit: the radiance of a white plane under the capture's lights. lobes: what
+    `invrender.refine.lobes` found of the photo, at most `WHOLE` pixels a side. interrupted: by
+    Ctrl-C, before all passes of the correction were done.
+    """
+
+    unit: float
+    lobes: Lobes | None = None
+    interrupted: bool = False
+
+
+def fitting(photo: Array, longest: int) -> tuple[int, int]:
+    """Height and width of the photo (H, W, 3) shrunk until the longer of them is ``longest``."""
+    height, width = photo.shape[:2]
+    scale = longest / max(height, width)
+    return max(1, round(height * scale)), max(1, round(width * scale))
+
+
+def shrunk(
+    longest: int, photo: Array, estimate: Prediction, clipped: NDArray[np.bool_] | None
+) -> tuple[Array, Prediction, NDArray[np.bool_] | None]:
+    """All of it shrunk until the longer side is ``longest``; what touches a saturated pixel is."""
+    low = fitting(photo, longest)
+    few = None if clipped is None else resize(clipped.astype(np.float32), *low) > 0
+    maps, sigma = resize_maps(estimate.maps, *low), resized(estimate.sigma, *low)
+    return resize(photo, *low), replace(estimate, maps=maps, sigma=sigma), few
+
+
+def resized(sigma: dict[str, Array], height: int, width: int) -> dict[str, Array]:
+    """Expected errors at another size."""
+    return {k: resize(v, height, width) for k, v in sigma.items()}
+
+
+def shaded(estimate: Prediction, coarse: Prediction, names: Iterable[str]) -> Prediction:
+    """The estimate, whose maps ``names`` take from a coarser one all that this one can show."""
+    own, maps = resize_maps(estimate.maps, *coarse.maps.shape), dict(vars(estimate.maps))
+    for name in names:
+        shades = getattr(coarse.maps, name) - getattr(own, name)
+        maps[name] = maps[name] + resize(shades, *estimate.maps.shape)
+    diffuse, specular = np.clip(maps["diffuse"], 0, 1), np.clip(maps["specular"], 0, 1)
+    roughness, normal = np.clip(maps["roughness"], MIN_ROUGHNESS, 1), unit_normals(maps["normal"])
+    return replace(estimate, maps=Maps(diffuse, specular, roughness, normal))
+
+
+def joined(fine: Prediction, whole: Prediction) -> Prediction:
+    """An estimate with the large shades and the expected errors of a coarser one."""
+    sigma = resized(whole.sigma, *fine.maps.shape)
+    return replace(
+        shaded(fine, whole, NAMES), sigma=sigma, lobes=whole.lobes, interrupted=whole.interrupted
+    )
