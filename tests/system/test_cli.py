@@ -1,7 +1,6 @@
 """The command line: the whole job on the bundled capture, and what bad input gets."""
 
 import json
-import shutil
 import subprocess
 import sys
 
@@ -9,49 +8,35 @@ import numpy as np
 import pytest
 
 from invrender.cli.main import main
-from invrender.data import EXAMPLE
 from invrender.files.images import read_image
 from invrender.files.maps import read_maps
 from invrender.files.write import write_exr
 from invrender.maps import NAMES
 
 
-@pytest.fixture
-def capture(tmp_path):
-    return shutil.copytree(EXAMPLE, tmp_path / "capture")
-
-
-@pytest.fixture(scope="module")
-def result(tmp_path_factory):
-    out = tmp_path_factory.mktemp("result") / "out"
-    command = ["refine", "example", "-o", str(out), "--size", "96", "--init", "flat", "--quiet"]
-    assert main(command) == 0
-    return out
-
-
-def test_network_starts_nearer(result, tmp_path):
+def test_network_starts_nearer(example_result):
     """The network's maps are nearer the truth than a flat sample's and its refinement's."""
-    out = tmp_path / "out"
-    assert main(["refine", "example", "-o", str(out), "--size", "96", "--quiet"]) == 0
     flat, network = (
-        json.loads((folder / "report.json").read_text())["map_error"] for folder in (result, out)
+        json.loads((example_result(init) / "report.json").read_text())["map_error"]
+        for init in ("flat", "network")
     )
     assert network["initial"]["average"] < 0.8 * flat["refined"]["average"]
     assert network["refined"]["average"] < 0.8 * flat["refined"]["average"]
 
 
-def test_result_is_complete(result):
+def test_result_is_complete(example_result):
+    result = example_result("flat")
     names = {f"{n}.{e}" for n in NAMES for e in ("exr", "png")}
     names |= {f"sigma_{n}.exr" for n in NAMES}
     names |= {"environment.exr", "coverage.exr", "pattern_shown.exr", "pattern_captured.exr"}
     names |= {"rig.toml", "sample.exr", "report.json", "report.html"}
     names |= {"photo.png", "render.png", "difference.png"}
     assert {p.name for p in result.iterdir()} == names
-    assert read_maps(result).shape == (96, 96)
+    assert read_maps(result).shape == (32, 32)
 
 
-def test_report_tells_what_was_gained(result):
-    report = json.loads((result / "report.json").read_text())
+def test_report_tells_what_was_gained(example_result):
+    report = json.loads((example_result("flat") / "report.json").read_text())
     assert report["photo_error"]["refined"] < 0.5 * report["photo_error"]["initial"]
     errors = report["map_error"]
     assert errors["refined"]["average"] < 0.8 * errors["initial"]["average"]

@@ -12,17 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from invrender.data import EXAMPLE
 from invrender.files.capture import load_capture
 from invrender.types import InputError
 
 ROOT = Path(__file__).parents[2]
 SOURCES = [p for part in ("invrender", "nets") for p in sorted((ROOT / part).rglob("*.py"))]
-
-
-@pytest.fixture
-def capture(tmp_path):
-    return shutil.copytree(EXAMPLE, tmp_path / "capture")
 
 
 def names(tree):
