@@ -55,8 +55,9 @@ def _read(path: Path) -> Raster:
         for h in headers
     )
     size = shown_high - shown_low + 1
-    check_size(path, int(size[0]), int(size[1]), 12)
-    check_size(path, int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1, 12)
+    check_size(path, int(size[0]), int(size[1]), 6)
+    check_size(path, int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1, 6)
+    # Each is decoded, and copied once, in two bytes or in four.
     check_size(path, 1, max(stored, 1), 4)
     with OpenEXR.File(str(path), separate_channels=True) as f:
         found = f.parts[index].channels
@@ -64,7 +65,8 @@ def _read(path: Path) -> Raster:
     raster = Raster(np.empty((0, 0, 3), np.float32), _encoding(path, header, layer))
     shape = (int(high[1] - low[1]) + 1, int(high[0] - low[0]) + 1)
     colours = _colours(path, raster, header, planes, shape)
-    alpha = _window(planes["A"], low, shown_low, size) if "A" in planes else None
+    alpha = planes.get("A")
+    alpha = None if alpha is None else _window(alpha.astype(np.float32), low, shown_low, size)
     raster.partial = bool(np.any(low > shown_low) or np.any(high < shown_high))
     raster.data = _window(colours, low, shown_low, size)
     if alpha is not None and not np.all(alpha == 1) and not raster.partial:
@@ -150,7 +152,7 @@ def _colours(
 ) -> Array:
     """(H, W, 3) of the data window from R, G, B, from Y alone, or from Y, RY and BY."""
     if all(c in planes and planes[c].shape == shape for c in "RGB"):
-        return np.stack([planes[c] for c in "RGB"], -1).astype(np.float32, copy=False)
+        return np.stack([planes.pop(c) for c in "RGB"], -1)
     full = {n: np.asarray(p, np.float32) for n, p in planes.items()}
     if "RY" in full:
         for name in ("RY", "BY"):
@@ -190,12 +192,11 @@ def _enlarged(plane: Array, shape: tuple[int, int]) -> Array:
 
 def _window(plane: Any, low: Any, shown_low: Any, size: Any) -> Array:
     """Pixels of the data window in the display window of ``size``; black where there are none."""
-    plane = np.asarray(plane, np.float32)
     x, y = (int(v) for v in low - shown_low)
     width, height = (int(v) for v in size)
     if (x, y) == (0, 0) and plane.shape[:2] == (height, width):
         return plane
-    shown = np.zeros((height, width, *plane.shape[2:]), np.float32)
+    shown = np.zeros((height, width, *plane.shape[2:]), plane.dtype)
     rows = slice(max(y, 0), min(y + plane.shape[0], height))
     columns = slice(max(x, 0), min(x + plane.shape[1], width))
     if rows.start < rows.stop and columns.start < columns.stop:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, cast
 
 import numpy as np
-from PIL import Image
+from PIL import AvifImagePlugin, Image, JpegImagePlugin, WebPImagePlugin
+from PIL.ImageFile import ImageFile
 
 from invrender.files.boxes import Picture, read_boxes
 from invrender.files.exif import exif_encoding, orientation, pillow_tags
@@ -44,36 +45,40 @@ def read_pillow(path: Path, kind: str) -> Raster:
         if kind in ("AVIF", "HEIF"):
             boxes = read_boxes(path)
             check_size(path, *(boxes.size or (1, 1)), 8)
-        if kind == "HEIF":
-            _register_heif(path)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            formats = ("JPEG", "MPO") if kind == "JPEG" else (kind,)
-            with Image.open(path, formats=formats) as im:
-                return _read(path, im, kind, boxes)
+            with open(path, "rb") as f:
+                return _read(path, _opened(path, f, kind), kind, boxes)
     except InputError:
         raise
-    except Image.DecompressionBombError:
-        raise InputError(f"{path} has more pixels than this program reads") from None
     except Exception:  # Pillow's decoders raise many kinds
         raise InputError(
             f"{path} is not a readable image (EXR, TIFF, PNG, JPEG and others), or not complete"
         ) from None
 
 
-def _register_heif(path: Path) -> None:
-    try:
-        import pillow_heif
-    except ModuleNotFoundError:
-        raise InputError(
-            f"{path} is a HEIC photo; to read it: pip install 'invrender[heif]', or save it as "
-            "JPEG or TIFF"
-        ) from None
-    # Ten and twelve bits stay what they are; what else lies in the file is not decoded.
-    pillow_heif.register_heif_opener(thumbnails=False, depth_images=False, aux_images=False)
+def _opened(path: Path, f: BinaryIO, kind: str) -> ImageFile:
+    """The image, not decoded; not by `Image.open`, which has a limit of pixels of its own."""
+    if kind == "HEIF":
+        try:
+            import pillow_heif
+        except ModuleNotFoundError:
+            raise InputError(
+                f"{path} is a HEIC photo; to read it: pip install 'invrender[heif]', or save it as "
+                "JPEG or TIFF"
+            ) from None
+        # What else lies in the file is not decoded.
+        pillow_heif.options.THUMBNAILS = pillow_heif.options.DEPTH_IMAGES = False
+        pillow_heif.options.AUX_IMAGES = False
+        return cast(ImageFile, pillow_heif.HeifImageFile(f))
+    if kind == "JPEG":
+        return cast(ImageFile, JpegImagePlugin.jpeg_factory(f))
+    if kind == "WEBP":
+        return WebPImagePlugin.WebPImageFile(f)
+    return AvifImagePlugin.AvifImageFile(f)
 
 
-def _read(path: Path, im: Image.Image, kind: str, boxes: Picture) -> Raster:
+def _read(path: Path, im: ImageFile, kind: str, boxes: Picture) -> Raster:
     frames = getattr(im, "n_frames", 1)
     if frames > 1 and kind in ("WEBP", "AVIF"):
         raise InputError(f"{path} is an animation; save the one picture")
@@ -103,8 +108,9 @@ def _read(path: Path, im: Image.Image, kind: str, boxes: Picture) -> Raster:
     return raster
 
 
-def _codes(path: Path, im: Image.Image, kind: str, boxes: Picture) -> tuple[Any, Any, int]:
+def _codes(path: Path, image: ImageFile, kind: str, boxes: Picture) -> tuple[Any, Any, int]:
     """(H, W, C) codes, alpha or None, and the code of white."""
+    im: Image.Image = image
     if kind == "AVIF" and boxes.bits > 8:  # Pillow's would be 8
         import imagecodecs
 
@@ -138,12 +144,10 @@ def _encoding(path: Path, raster: Raster, profile: bytes | None, boxes: Picture)
     return exif_encoding(raster)
 
 
-def _tell(path: Path, im: Image.Image, kind: str, boxes: Picture, raster: Raster) -> None:
+def _tell(path: Path, im: ImageFile, kind: str, boxes: Picture, raster: Raster) -> None:
     """Chroma subsampling and gain maps."""
     head = b""
     if kind == "JPEG":
-        from PIL import JpegImagePlugin
-
         if raster.data.shape[2] > 1 and JpegImagePlugin.get_sampling(im) != 0:
             raster.warn(*HALF_CHROMA)
     elif kind == "WEBP":

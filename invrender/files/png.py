@@ -37,8 +37,9 @@ def read_png(path: Path) -> Raster:
     blob = path.read_bytes()
     try:
         chunks = dict(_chunks(blob))
-        width, height, depth = struct.unpack_from(">IIB", chunks[b"IHDR"])
-        check_size(path, width, height, (2 if depth == 16 else 1) * 4 + len(blob) // max(width, 1))
+        width, height, depth, kind = struct.unpack_from(">IIBB", chunks[b"IHDR"])
+        channels = {0: 1, 2: 3, 3: 3, 4: 2}.get(kind, 4) + (b"tRNS" in chunks)
+        check_size(path, width, height, channels * (2 if depth == 16 else 1))
         if b"acTL" in chunks and struct.unpack_from(">I", chunks[b"acTL"])[0] > 1:
             raise InputError(f"{path} is an animation; save the one picture")
         codes = np.asarray(imagecodecs.png_decode(blob))

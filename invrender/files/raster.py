@@ -55,7 +55,7 @@ LINEAR = Encoding("linear Rec. 709")
 class Raster:
     """An image as a file holds it.
 
-    data: (H, W, C) codes (uint8 or uint16, up to ``white``) or float32; C is 1 or 3, or what
+    data: (H, W, C) codes (uint8 or uint16, up to ``white``) or floats; C is 1 or 3, or what
     ``encoding.convert`` takes. saturated: the share of white from which a code is.
     alpha: (H, W) in [0, 1], None where all is opaque; premultiplied: the colours hold it as a
     factor. orientation: EXIF's, 1 to 8. aspect: width of a pixel over its height. partial: the
@@ -206,8 +206,12 @@ def decode(raster: Raster, *, data: bool = False, reduction: int = 1) -> Array:
             factor = alpha[part, :, None]
             np.divide(light, factor, out=light, where=factor > 0)
         if reduction > 1:
-            blocks = light[:, : width * reduction].reshape(-1, reduction, width, reduction, 3)
-            target[:] = blocks.mean((1, 3))
+            # By strides: numpy's mean over two of five axes takes three times as long.
+            target[:] = 0
+            for k in range(reduction * reduction):
+                row, column = divmod(k, reduction)
+                target += light[row::reduction, column : width * reduction : reduction]
+            target /= reduction * reduction
     return image
 
 

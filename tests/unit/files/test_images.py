@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from invrender.colour import linear_to_srgb, srgb_to_linear
-from invrender.files import raster
+from invrender.files import images, pillow, raster
 from invrender.files.images import read_image, read_photo
 from invrender.files.write import atomic_path, write_exr, write_png
 from invrender.types import InputError
@@ -257,3 +257,23 @@ def test_failed_write_leaves_the_old_file(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["a.png"]
     with pytest.raises(ValueError, match="non-finite"):
         write_exr(tmp_path / "b.exr", np.full((2, 2, 3), np.inf))
+
+
+def test_photos_of_many_megapixels_are_averaged_down(tmp_path, monkeypatch):
+    """Means of light over whole blocks; what is left over at the border is dropped."""
+    monkeypatch.setattr(images, "WHOLE_PIXELS", 400)
+    Image.fromarray(RAMP[:43, :61]).save(tmp_path / "a.png")
+    photo = read_photo(tmp_path / "a.png")
+    whole = srgb_to_linear(RAMP[:42, :60] / 255.0)
+    expected = whole.reshape(14, 3, 20, 3, 3).mean((1, 3))
+    np.testing.assert_allclose(photo.image, expected, atol=1e-6)
+    assert [n.code for n in photo.notes] == ["photo-reduced"]
+    assert read_image(tmp_path / "a.png").shape == (43, 61, 3)
+
+
+def test_a_jpeg_beyond_memory_is_decoded_smaller(tmp_path, monkeypatch):
+    monkeypatch.setattr(raster, "MAX_MEMORY", 64 * 48)
+    monkeypatch.setattr(pillow, "MAX_MEMORY", 64 * 48)
+    smooth = np.linspace(60, 200, 64).astype(np.uint8)[None, :, None].repeat(48, 0).repeat(3, 2)
+    Image.fromarray(smooth).save(tmp_path / "a.jpg", quality=100)
+    assert read_image(tmp_path / "a.jpg").shape == (24, 32, 3)
