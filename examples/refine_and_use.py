@@ -40,9 +40,8 @@ def main(argv: list[str] | None = None) -> None:
         sigma = np.median(result.estimate.sigma[name])
         print(f"{name:>9}: mean {image.mean():.3f} ± {sigma:.3f}")
     if capture.truth is not None:
-        print(
-            "average error:", invrender.evaluate(result.estimate, capture.truth)["maps"]["average"]
-        )
+        errors = invrender.evaluate(result.estimate, capture.truth)
+        print(f"  average error {errors['maps']['average']:.4f}")
 
     # 3. The result, read again, in a room that the photo never saw, with the screen switched off.
     lights = replace(result.lights, environment=procedural_environment(seed=3), gain=0.0)
