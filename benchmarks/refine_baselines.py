@@ -1,11 +1,11 @@
 """The refinement's optimisers against others: map error against run time, from the same start.
 
 All start at the network's maps, on the same photo and lights. Most minimise one objective,
-Σ (photo - I)²/R + (θ - θ₀)ᵀΣ⁻¹(θ - θ₀), with the network's prior, its deviations times the `SHARE`
-of the cautious step: per-pixel Gauss–Newton, Adam and L-BFGS with this package's estimator and
-Jacobian; Adam with Mitsuba's path replay (`prb`, two renders with seeds of their own a step); Adam
+Σ (photo - I)²/R + (θ - θ₀)ᵀΣ⁻¹(θ - θ₀), with the network's prior, its deviations times the
+share of its step that each parameter takes: per-pixel Gauss–Newton, Adam and L-BFGS with this
+package's estimator and Jacobian; Adam with Mitsuba's path replay (`prb`, two renders with seeds of their own a step); Adam
 with plain PyTorch's autograd through the same integral. Adam's step is relative to the prior's
-deviations. Beside them what `invrender refine` does, the learned correction with its cautious step,
+deviations. Beside them what `invrender refine` does, the learned correction and the posterior step,
 and the network's own weights adapted to the photo by Adam, without a prior. Each has the one of its
 rates that makes its own objective lowest; the truth chooses nothing. Times are the process's own
 seconds, without compilation and without measuring.
@@ -34,8 +34,8 @@ from invrender.files.capture import load_capture
 from invrender.lights import Lights
 from invrender.maps import Maps, map_errors, resize_maps
 from invrender.pipeline import Sample
-from invrender.refine.cautious import SHARE, correct
 from invrender.refine.gauss_newton import PHOTO_NOISE, linearise, refine
+from invrender.refine.posterior import SETTINGS, explain
 from invrender.refine.priors import Prior, network_prior
 from invrender.refine.theta import project, to_maps, to_theta
 from invrender.render import brdf  # noqa: F401  (Dr.Jit's back end before Mitsuba)
@@ -61,13 +61,13 @@ class Problem:
         found = find_lights(load_capture(folder))
         assert found.capture.truth is not None
         self.lights: Lights = found.lights
-        self.shot = Sample.of(found, n).shot()
+        self.shot = Sample.of(found, n).observation()
         self.n, self.photo = n, self.shot.photo
         self.truth: Maps = resize_maps(found.capture.truth, n, n)
         self.network = Reconstructor()
         self.estimate = self.network(self.photo, self.lights)
         full = network_prior(self.estimate.maps, self.estimate.sigma)
-        cautious = (full.sigma * np.maximum(SHARE, LEAST)).astype(np.float32)
+        cautious = (full.sigma * np.maximum(SETTINGS.take, LEAST)).astype(np.float32)
         self.prior = Prior(full.mean, cautious, full.correlation)
         mean = float(self.photo.mean())
         self.noise = (PHOTO_NOISE[0] * self.photo) ** 2 + (PHOTO_NOISE[1] * mean) ** 2
@@ -229,7 +229,7 @@ def gauss_newton(problem: Problem) -> Curve:
 
 
 def chain(problem: Problem) -> Curve:
-    """The learned correction, then the cautious step."""
+    """The learned correction, then the posterior step."""
     improve = Corrector()
     curve = [point(problem, np.zeros_like(problem.prior.mean), 0.0)]
     for _ in range(2):  # the first compiles
@@ -237,7 +237,7 @@ def chain(problem: Problem) -> Curve:
         e = improve(problem.photo, problem.shot.renderer, problem.estimate, problem.shot.clipped)
         prior = network_prior(e.maps, e.sigma)
         times = [time.process_time() - began]
-        result = correct([problem.shot], prior)
+        result = explain([problem.shot], prior)
         times.append(time.process_time() - began)
     for theta, t in zip((prior.mean, to_theta(result.maps)), times, strict=True):
         curve.append(point(problem, (theta - problem.prior.mean) / problem.prior.sigma, t))
@@ -289,7 +289,7 @@ def measure(folder: Path, n: int, seconds: float, limit: int) -> dict[str, Curve
     problem = Problem(folder, n)
     curves = {
         "Gauss–Newton": gauss_newton(problem),
-        "correction, cautious step": chain(problem),
+        "correction, posterior step": chain(problem),
         "L-BFGS": lbfgs(problem, limit),
     }
     adapted = [adapt(problem, rate, seconds, limit) for rate in WEIGHT_RATES]
@@ -350,7 +350,7 @@ def main(args: argparse.Namespace) -> None:
             print(f"{folder.name} {name}: {curve[0][1]:.4f} → {best:.4f}", flush=True)
     bars = []
     for baseline, least in (("Adam, Mitsuba prb", 50.0), ("Adam, PyTorch", 5.0)):
-        for method in ("Gauss–Newton", "correction, cautious step"):
+        for method in ("Gauss–Newton", "correction, posterior step"):
             ratio = float(np.median([faster(c, method, baseline) for c in results.values()]))
             name = f"{method}: times faster than {baseline} to its best map error, median"
             bars.append(bar(name, ratio, least, at_least=True))

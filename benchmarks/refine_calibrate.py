@@ -3,8 +3,8 @@
 Refines captures like those of `refine`, but none of its materials and rooms, from the photo
 alone: real ones that the networks have seen, and half as many procedural ones that they have not.
 For each map, the factor on its sigma with which 68% of the truth lies within, of all pixels and
-captures of a kind together, and the mean over both kinds: what `invrender.refine.priors.UNTOLD` is
-to be multiplied by, again until it is one.
+captures of a kind together, and the mean over both kinds: what
+`invrender.refine.priors.ERROR_INFLATION` is to be multiplied by, again until it is one.
 """
 
 from __future__ import annotations

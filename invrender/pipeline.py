@@ -25,7 +25,7 @@ from invrender.report.result import SAMPLES, Result
 from invrender.types import Array, InputError, Mask
 
 if TYPE_CHECKING:  # Dr.Jit compiles where the refinement is imported
-    from invrender.refine.gauss_newton import Refined, Shot
+    from invrender.refine.gauss_newton import Observation, Refined
 
 MEGABYTES = 200e-6, 8  # of a result: a pixel, and for the rest
 
@@ -65,14 +65,14 @@ class Sample:
         crop, clipped = crop_sample(photo, rig, size), crop_mask(photo, rig, size)
         return cls(crop, clipped, found.lights)
 
-    def shot(self, turn: int = 0) -> Shot:
+    def observation(self, turn: int = 0) -> Observation:
         """With its forward model, turned counter-clockwise by quarters."""
-        from invrender.refine.gauss_newton import Shot
+        from invrender.refine.gauss_newton import Observation
         from invrender.render.fast.estimator import Fast
 
         photo = np.ascontiguousarray(np.rot90(self.photo, turn))
         clipped = np.rot90(self.clipped, turn) if self.clipped.any() else None
-        return Shot(photo, Fast.under(self.lights.turned(turn)), clipped)
+        return Observation(photo, Fast.under(self.lights.turned(turn)), clipped)
 
 
 def refine_capture(
@@ -192,7 +192,7 @@ def estimate_maps(
     init: str = "network",
     samples: int = 64,
     keep: Path | None = None,
-) -> tuple[Maps, Refined, list[Shot]]:
+) -> tuple[Maps, Refined, list[Observation]]:
     """Initial and refined maps, and the photos with their forward models in the first one's frame.
 
     keep: a folder for what the networks make of parts of large images; what lies there is not
@@ -205,15 +205,15 @@ def estimate_maps(
             networks = Reconstructor(), Corrector()
     with stage("forward model"):
         # Dr.Jit compiles here; nothing before needs it.
-        from invrender.refine.cautious import correct
         from invrender.refine.flat import flat_maps
         from invrender.refine.gauss_newton import Refined, refine
         from invrender.refine.lobes import fit_lobes
+        from invrender.refine.posterior import explain
         from invrender.refine.priors import lobe_prior, network_prior, pooled
         from invrender.refine.several import find_turn
         from invrender.refine.theta import to_maps
 
-        photos = [c.shot() for c in crops]
+        photos = [c.observation() for c in crops]
     if init == "flat":
         with stage("initial maps"):
             starts = [flat_maps(p.photo, p.renderer, samples) for p in photos]
@@ -240,7 +240,7 @@ def estimate_maps(
         ])  # fmt: skip
     with stage("forward model"):
         photos = [
-            photo if k == 0 else c.shot(-k)
+            photo if k == 0 else c.observation(-k)
             for photo, c, k in zip(photos, crops, turns, strict=True)
         ]
     with stage("refine"):
@@ -253,7 +253,7 @@ def estimate_maps(
             left = prior.sigma if prior.total is None else prior.total
             result = Refined(to_maps(prior.mean), left, interrupted=True)
         else:
-            result = correct(photos, prior, samples=samples)
+            result = explain(photos, prior, samples=samples)
     return starts[0], result, photos
 
 

@@ -35,14 +35,13 @@ from invrender.types import Array
 
 PHOTO_NOISE = (0.02, 0.01)  # relative to the pixel, and to the photo's mean: sensor and model
 TRUST = (0.1, 0.2)  # how far one step may move roughness and slopes
-UNLIKELY = 1.0  # mean squared residual, in its expected spread, from which a pixel counts less
 STOP = 0.02  # relative decrease of the mean cost below which steps end
 ROUNDING = 1e-5  # of the prior variance: what single precision can tell of the rest
 BAND = 1 << 17  # pixels solved at once
 
 
 @dataclass(frozen=True)
-class Shot:
+class Observation:
     """A photo (H, W, 3) of the sample, linear radiance, and the lights on it.
 
     clipped (H, W): pixels that the photo does not measure; None where it measures all.
@@ -103,21 +102,25 @@ def linearise(
     return rows(j.radiance).copy(), np.nan_to_num(jacobian, posinf=0, neginf=0)
 
 
-class _Band:
-    """Rows of the stacked photos: ``photo`` and its variance ``noise`` (H, W, 3·shots).
+class Band:
+    """Rows of the stacked photos: ``photo`` and its variance ``noise`` (H, W, 3·photos).
 
     noise: shares of the pixel and of its photo's mean, or next to infinite where not ``seen``.
     """
 
     def __init__(
-        self, shots: Sequence[Shot], rows: slice, share: tuple[float, float], samples: int
+        self,
+        observations: Sequence[Observation],
+        rows: slice,
+        share: tuple[float, float],
+        samples: int,
     ) -> None:
-        self.shots, self.rows, self.samples = shots, rows, samples
-        photos = [s.photo[rows] for s in shots]
-        means = [max(float(s.photo.mean()), 1e-12) for s in shots]
+        self.observations, self.rows, self.samples = observations, rows, samples
+        photos = [s.photo[rows] for s in observations]
+        means = [max(float(s.photo.mean()), 1e-12) for s in observations]
         seen = [
             np.ones(p.shape[:2], bool) if s.clipped is None else ~s.clipped[rows]
-            for s, p in zip(shots, photos, strict=True)
+            for s, p in zip(observations, photos, strict=True)
         ]
         self.photo = np.concatenate(photos, -1)
         self.mean = np.repeat(np.array(means, np.float32), 3)
@@ -126,11 +129,11 @@ class _Band:
         self.noise = np.where(self.seen, noise, np.float32(1e12) * self.mean**2)
 
     def residual(self, theta: Array) -> tuple[Array, Array]:
-        """photo - I(θ) and the Jacobian (H, W, 3·shots, 9)."""
-        height = len(self.shots[0].photo)
+        """photo - I(θ) and the Jacobian (H, W, 3·photos, 9)."""
+        height = len(self.observations[0].photo)
         parts = [
             linearise(s.renderer, theta, self.samples, top=self.rows.start, height=height)
-            for s in self.shots
+            for s in self.observations
         ]
         image, jacobian = (np.concatenate(x, 2) for x in zip(*parts, strict=True))
         return self.photo - image, jacobian
@@ -140,15 +143,17 @@ class _Band:
         return float((((residual / self.mean) ** 2)[self.seen]).sum(dtype=np.float64))
 
 
-def _bands(shots: Sequence[Shot], share: tuple[float, float], samples: int) -> Iterator[_Band]:
-    height, width = shots[0].photo.shape[:2]
+def bands(
+    observations: Sequence[Observation], share: tuple[float, float], samples: int
+) -> Iterator[Band]:
+    height, width = observations[0].photo.shape[:2]
     rows = max(1, BAND // width)
     for top in range(0, height, rows):
-        yield _Band(shots, slice(top, min(top + rows, height)), share, samples)
+        yield Band(observations, slice(top, min(top + rows, height)), share, samples)
 
 
 def refine(
-    shots: Sequence[Shot],
+    observations: Sequence[Observation],
     prior: Prior,
     *,
     samples: int = 64,
@@ -166,7 +171,7 @@ def refine(
     result = Refined(to_maps(theta), sigma, converged=True)
     seen = 0
     try:
-        for band in _bands(shots, PHOTO_NOISE, samples):
+        for band in bands(observations, PHOTO_NOISE, samples):
             seen += int(band.seen.sum())
             steps.append([])
             result.converged &= _solve(band, prior, theta, sigma, iterations, steps[-1], progress)
@@ -183,7 +188,7 @@ def refine(
 
 
 def _solve(
-    band: _Band, prior: Prior, theta: Array, sigma: Array, iterations: int,
+    band: Band, prior: Prior, theta: Array, sigma: Array, iterations: int,
     steps: list[Array], progress: Callable[[int, float], None],
 ) -> bool:  # fmt: skip
     """Gauss–Newton on a band's rows of ``theta`` and ``sigma``, in place. Whether it converged.
@@ -211,8 +216,8 @@ def _solve(
             return True
         if i == iterations:
             break
-        a, ac, inverse = _spread(jacobian, sigma, prior.correlation, band.noise)
-        gain = np.swapaxes(ac, -1, -2) @ inverse
+        a, ac, spread = expected_spread(jacobian, sigma, prior.correlation, band.noise)
+        gain = np.swapaxes(ac, -1, -2) @ np.linalg.inv(spread)
         z = (theta - mean) / sigma
         target = residual + np.einsum("hwcp,hwp->hwc", a, z)
         step = sigma * (np.einsum("hwpc,hwc->hwp", gain, target) - z)
@@ -229,13 +234,13 @@ def _solve(
     return False
 
 
-def _spread(
+def expected_spread(
     jacobian: Array, sigma: Array, correlation: Array, noise: Array
 ) -> tuple[Array, Array, Array]:
-    """A = J·diag(σ), A·C and the inverse of the residual's expected spread A·C·Aᵀ + R."""
+    """A = J·diag(σ), A·C and the residual's expected spread A·C·Aᵀ + R."""
     a = jacobian * sigma[..., None, :]
     ac = a @ correlation
     spread = ac @ np.swapaxes(a, -1, -2)
     n = range(spread.shape[-1])
     spread[..., n, n] += noise
-    return a, ac, np.linalg.inv(spread)
+    return a, ac, spread

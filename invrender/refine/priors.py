@@ -17,7 +17,7 @@ from invrender.types import Array
 
 # By how much errors exceed what the networks expect, in the order of θ, where lights are estimated:
 # benchmarks/refine_calibrate.py, with the weights in the package.
-UNTOLD = np.array([2.05] * 3 + [1.1] * 3 + [1.1] + [1.35] * 2, np.float32)
+ERROR_INFLATION = np.array([2.05] * 3 + [1.1] * 3 + [1.1] + [1.35] * 2, np.float32)
 
 
 @dataclass
@@ -50,17 +50,17 @@ def network_prior(maps: Maps, sigma: dict[str, Array]) -> Prior:
     """The uncertainty of a network's maps, from what it expects of its errors, (H, W) a map.
 
     ``sigma`` of normals is that of n/2 + 1/2. An albedo's error within a material is at most a
-    share of it. The total error is `UNTOLD` times what the network expects; a step is made with
-    the same part of each, so that none grows by it.
+    share of it. The total error is `ERROR_INFLATION` times what the network expects; a step is made
+    with the same part of each, so that none grows by it.
     """
     mean = to_theta(maps)
-    told = np.empty_like(mean)
-    told[..., D], told[..., S] = (sigma[k][..., None] for k in ("diffuse", "specular"))
-    told[..., R] = sigma["roughness"]
-    told[..., N] = 2 * sigma["normal"][..., None]
-    told = np.maximum(told, 1e-4)
-    total = UNTOLD * told
-    spread = total / UNTOLD.max()
+    nominal = np.empty_like(mean)
+    nominal[..., D], nominal[..., S] = (sigma[k][..., None] for k in ("diffuse", "specular"))
+    nominal[..., R] = sigma["roughness"]
+    nominal[..., N] = 2 * sigma["normal"][..., None]
+    nominal = np.maximum(nominal, 1e-4)
+    total = ERROR_INFLATION * nominal
+    spread = total / ERROR_INFLATION.max()
     spread[..., D] = np.minimum(spread[..., D], 0.01 + 0.15 * maps.diffuse)
     spread[..., S] = np.minimum(spread[..., S], 0.01 + 0.3 * maps.specular)
     return Prior(mean, spread, _correlation(0.9, 0.95), total)

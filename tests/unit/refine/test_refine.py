@@ -11,11 +11,11 @@ from invrender.lights import Lights
 from invrender.maps import constant_maps, map_errors, turn_maps
 from invrender.pattern.default import block_pattern
 from invrender.refine import gauss_newton as refinement
-from invrender.refine.cautious import correct
 from invrender.refine.checks import baked_light, coarse_error
 from invrender.refine.flat import flat_maps
-from invrender.refine.gauss_newton import Shot, linearise, refine
+from invrender.refine.gauss_newton import Observation, linearise, refine
 from invrender.refine.lobes import fit_lobes, read_lobes
+from invrender.refine.posterior import explain
 from invrender.refine.priors import Prior, lobe_prior, network_prior, pooled
 from invrender.refine.several import find_turn
 from invrender.refine.theta import MIN_ROUGHNESS, to_maps, to_theta
@@ -132,7 +132,7 @@ def test_two_materials_get_two_lobes(renderer, environment):
 
 def test_photo_of_the_prior_changes_nothing(renderer, environment):
     maps = constant_maps(SIZE, SIZE, 0.3, 0.04, 0.5)
-    result = refine([Shot(photo_of(maps, environment), renderer)], lobe_prior(maps))
+    result = refine([Observation(photo_of(maps, environment), renderer)], lobe_prior(maps))
     assert result.converged
     assert max(map_errors(result.maps, maps).values()) < 1e-3
 
@@ -148,7 +148,7 @@ def test_normals_are_recovered_where_all_else_is_known(renderer, environment):
     sigma = np.full((SIZE, SIZE, 9), 1e-3, np.float32)
     sigma[..., 7:] = 0.3
     prior = Prior(to_theta(start), sigma, np.eye(9, dtype=np.float32))
-    result = refine([Shot(photo, renderer)], prior)
+    result = refine([Observation(photo, renderer)], prior)
     before, after = map_errors(start, truth), map_errors(result.maps, truth)
     assert after["normal"] < 0.7 * before["normal"]
     errors = [h["photo_error"] for h in result.history]
@@ -165,7 +165,7 @@ def test_clipped_pixels_keep_their_prior(renderer, environment):
     prior = lobe_prior(constant_maps(SIZE, SIZE, 0.2, 0.04, 0.5))
     clipped = np.zeros((SIZE, SIZE), bool)
     clipped[:8] = True
-    result = refine([Shot(photo_of(truth, environment), renderer, clipped)], prior)
+    result = refine([Observation(photo_of(truth, environment), renderer, clipped)], prior)
     np.testing.assert_allclose(result.maps.diffuse[:8], 0.2, atol=1e-3)
     assert result.maps.diffuse[8:].mean() > 0.25
 
@@ -174,7 +174,7 @@ def test_clipped_pixels_keep_their_prior(renderer, environment):
 def test_any_photo_gives_finite_maps_in_range(renderer, value):
     photo = np.full((8, 8, 3), value, np.float32)
     maps = fit_lobes(photo, renderer)
-    result = refine([Shot(photo, renderer)], lobe_prior(maps), iterations=3)
+    result = refine([Observation(photo, renderer)], lobe_prior(maps), iterations=3)
     for image in result.maps.encoded().values():
         assert np.isfinite(image).all() and image.min() >= 0 and image.max() <= 1
     assert (result.maps.diffuse + result.maps.specular).max() <= 1 + 1e-6
@@ -184,7 +184,7 @@ def test_any_photo_gives_finite_maps_in_range(renderer, value):
 
 def test_one_pixel(renderer):
     photo = np.full((1, 1, 3), 0.1, np.float32)
-    result = refine([Shot(photo, renderer)], lobe_prior(fit_lobes(photo, renderer)))
+    result = refine([Observation(photo, renderer)], lobe_prior(fit_lobes(photo, renderer)))
     assert result.maps.shape == (1, 1)
 
 
@@ -197,7 +197,7 @@ def test_correction_of_a_networks_maps(renderer, environment):
     clipped = np.zeros((SIZE, SIZE), bool)
     clipped[:8] = True
     prior = network_prior(start, sigma)
-    result = correct([Shot(photo_of(truth, environment), renderer, clipped)], prior)
+    result = explain([Observation(photo_of(truth, environment), renderer, clipped)], prior)
     assert map_errors(result.maps, truth)["diffuse"] < 0.7 * map_errors(start, truth)["diffuse"]
     assert np.array_equal(result.maps.roughness, start.roughness)
     assert result.maps.diffuse[:8] == pytest.approx(start.diffuse[:8], abs=1e-5)
@@ -225,15 +225,15 @@ def test_two_photos_tell_more_than_one(renderer, environment):
     photo = Fast(make_scene(RIG, other, environment, GAIN)).render(turn_maps(truth, 1))
     turned = Lights(RIG, other, environment, GAIN).turned(-1)
     shots = [
-        Shot(photo_of(truth, environment), renderer),
-        Shot(np.ascontiguousarray(np.rot90(photo, -1)), Fast.under(turned)),
+        Observation(photo_of(truth, environment), renderer),
+        Observation(np.ascontiguousarray(np.rot90(photo, -1)), Fast.under(turned)),
     ]
     # The turned photo is what the turned lights make of the sample that lies as before.
     image, _ = linearise(shots[1].renderer, to_theta(truth), 64)
     assert np.abs(image - shots[1].photo).mean() < 0.02 * image.mean()
 
     prior = wrong_by(truth, 0)
-    for step in (correct, refine):
+    for step in (explain, refine):
         one = map_errors(step(shots[:1], prior).maps, truth)["average"]
         two = map_errors(step(shots, prior).maps, truth)["average"]
         assert two < 0.98 * one
@@ -261,10 +261,10 @@ def test_turn_is_found():
 
 def test_bands_give_what_the_whole_gives(renderer, environment, monkeypatch):
     truth = procedural_material(7, SIZE, SIZE)
-    shots, prior = [Shot(photo_of(truth, environment), renderer)], wrong_by(truth, 1)
-    whole = refine(shots, prior, iterations=2), correct(shots, prior)
+    shots, prior = [Observation(photo_of(truth, environment), renderer)], wrong_by(truth, 1)
+    whole = refine(shots, prior, iterations=2), explain(shots, prior)
     monkeypatch.setattr(refinement, "BAND", 5 * SIZE)
-    parts = refine(shots, prior, iterations=2), correct(shots, prior)
+    parts = refine(shots, prior, iterations=2), explain(shots, prior)
     for a, b in zip(whole, parts, strict=True):
         assert max(map_errors(a.maps, b.maps).values()) < 1e-3
         np.testing.assert_allclose(a.sigma, b.sigma, atol=1e-3)
@@ -279,7 +279,7 @@ def test_interrupt_keeps_the_best_so_far(renderer, environment):
         if step == 1:
             raise KeyboardInterrupt
 
-    result = refine([Shot(photo_of(truth, environment), renderer)], prior, progress=stop)
+    result = refine([Observation(photo_of(truth, environment), renderer)], prior, progress=stop)
     assert result.interrupted and not result.converged
     error = np.abs(result.maps.diffuse - truth.diffuse).mean()
     assert error < np.abs(prior.mean[..., :3] - truth.diffuse).mean()
