@@ -3,7 +3,8 @@
 All start at the network's maps, on the same photo and lights. Most minimise one objective,
 Σ (photo - I)²/R + (θ - θ₀)ᵀΣ⁻¹(θ - θ₀), with the network's prior, its deviations times the
 share of its step that each parameter takes: per-pixel Gauss–Newton, Adam and L-BFGS with this
-package's estimator and Jacobian; Adam with Mitsuba's path replay (`prb`, two renders with seeds of their own a step); Adam
+package's estimator and Jacobian; Adam with Mitsuba's path replay (`prb`, two renders with seeds of
+their own a step); Adam
 with plain PyTorch's autograd through the same integral. Adam's step is relative to the prior's
 deviations. Beside them what `invrender refine` does, the learned correction and the posterior step,
 and the network's own weights adapted to the photo by Adam, without a prior. Each has the one of its
