@@ -90,7 +90,7 @@ def light_inputs(
     size: int = CLUE_SIZE,
     samples: int = SAMPLES,
 ) -> dict[str, Array]:
-    """All that the network is told about the light, as float32 arrays without a batch axis.
+    """The network's inputs that describe the light, as float32 arrays without a batch axis.
 
     pattern (P, P, 3) relative radiance, gain RGB; environment (H, 2H, 3) radiance or None;
     ``captured``: the screen's radiance as the ball shows it, if that is known. Returns, channels

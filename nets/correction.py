@@ -24,14 +24,25 @@ from torch import Tensor, nn
 
 from nets.batch import Batch, split_channels
 from nets.blocks import Decoder, Encoder, blocks, channels_last_cat, pad_to
-from nets.model import MAX_SIGMA, MIN_ROUGHNESS, MIN_SIGMA, Config, encode, slope_normal
+from nets.model import (
+    ENCODE_FLOOR,
+    LEAST_MAP_ROUGHNESS,
+    MAX_SIGMA,
+    MIN_SIGMA,
+    Config,
+    encode,
+    slope_normal,
+)
 from nets.slopes import asinh
 
-NOISE = (0.04, 0.01)  # of the photo: relative to the pixel, and to a white plane
+PHOTO_NOISE = (0.04, 0.01)  # of the photo: relative to the pixel, and to a white plane
 ALBEDO_CORRELATION = (0.9, 0.95)  # between the colours of k_d's error, and of k_s's
 REACH = (0.1, 0.1, 0.1, 0.2)  # of a step, in the outputs' unit: k_d, k_s, ρ, slopes
+SIGMA_OFFSET = 1.5  # brings half the logarithm of an expected error to about [-1.5, 1.5]
+MAX_SURPRISE = 1e4  # mean squared residual in its expected spread
 DOUBT = 3.0  # logit by which a fresh correction keeps to the network's maps and not to the lobes
-OUTPUTS = {"step": 9, "log_sigma": 4, "towards_lobes": 7}  # the decoder's, and channels of each
+# What the decoder puts out, and how many channels each.
+CORRECTION_OUTPUTS = {"step": 9, "log_sigma": 4, "towards_lobes": 7}
 LOG_SIGMA_CHANGE = (-3.0, 2.0)  # bounds of the change of an expected error, as a logarithm
 INPUTS = 3 * 4 + 9 + 4 + 9 + 6 + 9 + 1 + 2 + 7
 
@@ -47,7 +58,7 @@ def gauss_newton(batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
     slope = 2 * normal
     shared = [(diffuse * e, ALBEDO_CORRELATION[0]), (specular * b, ALBEDO_CORRELATION[1])]
     shared += [(rough * r, 1.0), (slope * p, 1.0), (slope * q, 1.0)]
-    noise = (NOISE[0] * photo) ** 2 + NOISE[1] ** 2
+    noise = (PHOTO_NOISE[0] * photo) ** 2 + PHOTO_NOISE[1] ** 2
     # JΣJᵀ + R, symmetric: each term is ρ·vvᵀ + (1 - ρ)·diag(v²).
     entries = {}
     for i in range(3):
@@ -85,15 +96,15 @@ def features(batch: Batch) -> Tensor:
     photo, image, theta = batch["photo"], batch["image"], batch["theta"]
     _, step, surprise = gauss_newton(batch)
     e, b = batch["jacobian"][:, :3], batch["jacobian"][:, 3:6]
-    level = image.clamp(min=0.02)
+    level = image.clamp(min=ENCODE_FLOOR)
     parts = [
         encode(photo), encode(image), encode(e), encode(b),
         2 * theta[:, :7] - 0.5, theta[:, 7:],
-        torch.log(batch["sigma0"].clamp(min=MIN_SIGMA)) / 2 + 1.5,
+        torch.log(batch["sigma0"].clamp(min=MIN_SIGMA)) / 2 + SIGMA_OFFSET,
         asinh(batch["jacobian"][:, 6:] / level.repeat(1, 3, 1, 1)),
         theta[:, :3] * e / level, theta[:, 3:6] * b / level,
         step.clamp(-3, 3),
-        torch.log1p(surprise.clamp(0, 1e4)) / 2,
+        torch.log1p(surprise.clamp(0, MAX_SURPRISE)) / 2,
         batch["position"],
         2 * batch["lobes"] - 0.5,
     ]  # fmt: skip
@@ -113,7 +124,7 @@ class Correction(nn.Module):
         self.multiple = 1 << levels
         self.encoder = Encoder(INPUTS, width, config.encoder)
         self.middle = blocks(width << levels, config.middle)
-        self.decoder = Decoder(sum(OUTPUTS.values()), width, config.decoder)
+        self.decoder = Decoder(sum(CORRECTION_OUTPUTS.values()), width, config.decoder)
         nn.init.zeros_(self.decoder.ending.weight)  # a fresh one changes next to nothing
         nn.init.zeros_(self.decoder.ending.bias)  # type: ignore[arg-type]
         reach = torch.tensor(REACH).repeat_interleave(torch.tensor([3, 3, 1, 2]))
@@ -125,7 +136,7 @@ class Correction(nn.Module):
         x = torch.nan_to_num(features(batch), 0.0, 0.0, 0.0)
         y, skips = self.encoder(pad_to(x, self.multiple))
         y = self.decoder(self.middle(y), skips)[..., :height, :width]
-        out = split_channels(y, OUTPUTS)
+        out = split_channels(y, CORRECTION_OUTPUTS)
         # Some of the way to the lobes, by the network's judgement, and a step of its own.
         share = torch.sigmoid(out["towards_lobes"] - DOUBT)
         towards = share * (batch["lobes"] - batch["theta"][:, :7])
@@ -134,7 +145,7 @@ class Correction(nn.Module):
         diffuse, specular, roughness = theta[:, :3], theta[:, 3:6], theta[:, 6:7]
         if not self.training:
             diffuse, specular = diffuse.clamp(0, 1), specular.clamp(0, 1)
-            roughness = roughness.clamp(MIN_ROUGHNESS, 1)
+            roughness = roughness.clamp(LEAST_MAP_ROUGHNESS, 1)
         sigma = batch["sigma0"].clamp(MIN_SIGMA, MAX_SIGMA)
         sigma = sigma * torch.exp(out["log_sigma"].clamp(*LOG_SIGMA_CHANGE))
         sigma = (sigma * self.calibration[:, None, None]).clamp(MIN_SIGMA, MAX_SIGMA)

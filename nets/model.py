@@ -43,13 +43,15 @@ LIGHTS = ("env_clues", "active_clues", "slope_clues", "sky", "screen", "ball", "
 WHITE_CLUE = slice(3 * WHITE, 3 * WHITE + 3)  # the white plane's channels of plane clues
 
 DIELECTRIC_F0 = 0.04  # of common plastics, stone and paint: an index of refraction of 1.5
-MIN_ROUGHNESS = 0.02  # of the maps that leave the network; smoother looks the same in a photo
+LEAST_MAP_ROUGHNESS = 0.02  # of the maps that leave the network; smoother looks the same in a photo
 # Bounds of the expected errors, in the maps' unit: half of an 8-bit step, and all of a map's range.
 MIN_SIGMA, MAX_SIGMA = 0.002, 1.0
 LEAST_LOG_SIGMA = -6.2  # log of `MIN_SIGMA`
 MAX_RADIANCE = 1e4  # of lights, in units of a white plane: what float16 shards can hold
-MAX_PHOTO = 1e3  # likewise of what `encode` tells apart
-DARK = 0.02  # radiance in units of a white plane from which on `encode` is logarithmic
+MAX_PHOTO = 1e3  # likewise of what `encode` resolves
+ENCODE_FLOOR = 0.02  # radiance in units of a white plane from which on `encode` is logarithmic
+ENCODE_SCALE, ENCODE_OFFSET = 0.25, 0.4  # of its logarithm, which bring it to about [-1, 1]
+LEAST_LEVEL = 1e-20  # of white, in any unit: below it nothing is seen
 MAX_RATIO = 4.0  # of photo to white plane; a highlight beyond it is as bright as any
 HIDDEN_COSTS = 64  # units between the fits' costs and the bottleneck
 
@@ -102,8 +104,8 @@ class View:
 
 
 def encode(x: Tensor) -> Tensor:
-    """Radiance in units of a white plane to about [-1, 1], log-like from `DARK` upwards."""
-    return torch.log2(x.clamp(0, MAX_PHOTO) + DARK) * 0.25 + 0.4
+    """Radiance in units of a white plane to about [-1, 1], log-like from `ENCODE_FLOOR` upwards."""
+    return torch.log2(x.clamp(0, MAX_PHOTO) + ENCODE_FLOOR) * ENCODE_SCALE + ENCODE_OFFSET
 
 
 class Network(nn.Module):
@@ -200,7 +202,7 @@ class Network(nn.Module):
     def screen_inputs(self, view: View) -> list[Tensor]:
         """The photo over what a white plane shows, and what others show under the screen alone."""
         white = view.active[:, WHITE_CLUE] + view.plane[:, WHITE_CLUE]
-        ratio = view.photo / (white / ALBEDO + DARK)
+        ratio = view.photo / (white / ALBEDO + ENCODE_FLOOR)
         return [
             ratio.clamp(max=MAX_RATIO),
             encode(torch.cat([view.active[:, :3], view.active[:, 6:]], 1)),
@@ -264,7 +266,7 @@ def grey(images: Tensor) -> Tensor:
 
 
 def _least(name: str) -> float:
-    return MIN_ROUGHNESS if name == "roughness" else 0.0
+    return LEAST_MAP_ROUGHNESS if name == "roughness" else 0.0
 
 
 def _mean(own: Tensor, dielectric: Tensor, metal: Tensor, logits: Tensor) -> Tensor:
@@ -297,7 +299,7 @@ def normalise(batch: Batch, lights: Sequence[str] = ("active_clues", "env_clues"
     becomes black."""
     white = [batch[k][:, WHITE_CLUE].mean((1, 2, 3)) for k in lights]
     level = torch.stack(white).sum(0) / ALBEDO
-    scale = 1 / torch.nan_to_num(level, 1.0).clamp(min=1e-20)
+    scale = 1 / torch.nan_to_num(level, 1.0).clamp(min=LEAST_LEVEL)
     out = dict(batch)
     for key in ("photo", "target", *LIGHTS):
         if key in batch:

@@ -22,7 +22,7 @@ from invrender.sampling import resize
 from invrender.types import Array, InputError
 from nets.batch import Batch, batch_of, lobe_input, positions
 from nets.clues import light_inputs, white_level
-from nets.model import MAPS, MAX_PHOTO
+from nets.model import LEAST_LEVEL, MAPS, MAX_PHOTO
 from nets.scales import COARSE, WHOLE, Prediction, fitting, joined, shaded, shrunk
 from nets.store import load_weights
 from nets.tiles import predict, tile_folder
@@ -30,8 +30,8 @@ from nets.tiles import predict, tile_folder
 WEIGHTS = Path(__file__).with_name("weights")
 PASSES = 3  # of the correction, at most
 SETTLED = 0.04  # mean change of roughness from which on another pass follows
+LEAST_LENGTH = 1e-6  # of a normal that is a mean over tiles
 LIGHTS_SHARE = 0.3  # of the time that a reconstruction takes: the preparation of the lights
-DARKNESS = 1e-20  # least level of white, in any unit: what has no light has no maps either
 
 
 class Reconstructor:
@@ -64,7 +64,7 @@ class Reconstructor:
         rig, pattern, room = lights.rig, lights.pattern, lights.environment
         inputs = light_inputs(rig, pattern, lights.gain, room, lights.pattern_captured)
         unit = white_level(inputs)
-        scale = 1 / max(unit, DARKNESS)
+        scale = 1 / max(unit, LEAST_LEVEL)
         scene = make_scene(rig, pattern, room, np.asarray(lights.gain) * scale, scale)
         renderer = Fast(scene)
         report(LIGHTS_SHARE)
@@ -151,7 +151,7 @@ def linearised(
     image, jacobian = linearise(renderer, theta, samples)
     diagonal = [jacobian[..., range(3), range(k, k + 3)] for k in (0, 3)]
     columns = [jacobian[..., k] for k in (6, 7, 8)]
-    unit = max(estimate.unit, DARKNESS)
+    unit = max(estimate.unit, LEAST_LEVEL)
     seen = np.zeros((height, width), bool) if clipped is None else clipped
     images = {
         "photo": photo / unit,
@@ -169,7 +169,7 @@ def estimate_of(out: Batch, unit: float) -> Prediction:
     """The first capture of a network's output, as numpy arrays."""
     image = lambda x: np.ascontiguousarray(x[0].permute(1, 2, 0).numpy())  # noqa: E731
     normal = image(out["normal"])
-    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), LEAST_LENGTH)
     maps = Maps(
         image(out["diffuse"]), image(out["specular"]), image(out["roughness"])[..., 0], normal
     )

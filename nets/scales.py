@@ -13,7 +13,7 @@ from invrender.maps import NAMES, Estimate, Maps, resize_maps, unit_normals
 from invrender.refine.lobes import Lobes
 from invrender.sampling import resize
 from invrender.types import Array
-from nets.model import MIN_ROUGHNESS
+from nets.model import LEAST_MAP_ROUGHNESS
 
 WHOLE = 256  # pixels of the longer side at which a sample is judged as a whole
 COARSE = 128  # pixels of the longer side at which the correction was trained
@@ -62,7 +62,8 @@ def shaded(estimate: Prediction, coarse: Prediction, names: Iterable[str]) -> Pr
         shades = getattr(coarse.maps, name) - getattr(own, name)
         maps[name] = maps[name] + resize(shades, *estimate.maps.shape)
     diffuse, specular = np.clip(maps["diffuse"], 0, 1), np.clip(maps["specular"], 0, 1)
-    roughness, normal = np.clip(maps["roughness"], MIN_ROUGHNESS, 1), unit_normals(maps["normal"])
+    roughness = np.clip(maps["roughness"], LEAST_MAP_ROUGHNESS, 1)
+    normal = unit_normals(maps["normal"])
     return replace(estimate, maps=Maps(diffuse, specular, roughness, normal))
 
 

@@ -21,11 +21,11 @@ from torch import Tensor
 
 from nets.clues import SLOPED, WHITE
 
-NEAR = 8  # pixels a side of the neighbourhood
-SLOPE, NOISE = 0.2, 0.01  # standard deviations of slopes and of log I
+NEIGHBOURHOOD = 8  # pixels a side of the neighbourhood
+SLOPE, LOG_NOISE = 0.2, 0.01  # standard deviations of slopes and of log I
 ALBEDO_SPREADS = ((0.05, 0.03), (0.3, 0.08))  # those of grey and of colour: plain, and textured
-MATERIALS = ((3, 0), (2, 1))  # place in `BASIS` and in `SLOPED`: white, and rough specular
-SLOPE_FEATURES = 3 + 18 + 4 * len(MATERIALS)
+SLOPE_MATERIALS = ((3, 0), (2, 1))  # place in `BASIS` and in `SLOPED`: white, and rough specular
+SLOPE_FEATURES = 3 + 18 + 4 * len(SLOPE_MATERIALS)
 LEAST_RADIANCE = 1e-3  # that counts as light, in units of a white plane
 MOST_RELATIVE = 100.0  # |g|: a sharp lobe's flank on black
 MOST_SLOPE = 3.0  # 72 degrees
@@ -43,7 +43,7 @@ def slope_features(photo: Tensor, plane: Tensor, derivatives: Tensor) -> list[Te
     g = g.clamp(-MOST_RELATIVE, MOST_RELATIVE)
     log_photo = torch.log(photo + LEAST_RADIANCE)
     estimates = []
-    for material, place in MATERIALS:
+    for material, place in SLOPE_MATERIALS:
         ratio = log_photo - torch.log(base[:, material] + LEAST_RADIANCE)
         detail = ratio - _nearby(ratio)
         found = posteriors(detail, g[:, 0, place], g[:, 1, place], ALBEDO_SPREADS)
@@ -57,9 +57,9 @@ def asinh(x: Tensor) -> Tensor:
 
 
 def _nearby(x: Tensor) -> Tensor:
-    """Means over `NEAR` × `NEAR` pixels, smooth between."""
+    """Means over `NEIGHBOURHOOD` × `NEIGHBOURHOOD` pixels, smooth between."""
     h, w = x.shape[-2:]
-    coarse = F.avg_pool2d(x, (min(NEAR, h), min(NEAR, w)), ceil_mode=True)
+    coarse = F.avg_pool2d(x, (min(NEIGHBOURHOOD, h), min(NEIGHBOURHOOD, w)), ceil_mode=True)
     return F.interpolate(coarse, (h, w), mode="bilinear", align_corners=False)
 
 
@@ -76,7 +76,7 @@ def posteriors(
     sums = {k: totals[id(a)] * totals[id(b)] for k, (a, b) in pairs.items()}
     found = []
     for grey, colour in spreads:
-        own = colour**2 + NOISE**2
+        own = colour**2 + LOG_NOISE**2
         shared = grey**2 / (own + 3 * grey**2)
         # aᵀR⁻¹b by Sherman and Morrison.
         pp, qq, pq, x, y = ((products[k] - shared * sums[k]) / own for k in pairs)

@@ -35,6 +35,14 @@ SKY_SIZE = 40
 SKY_ROWS = 64  # of the equirectangular image that is filtered
 SCREEN_MARGIN = 0.5
 SCREEN_SIZE = 48
+# Of lobes filtered on a grid: their least width in texels (about a texel's standard deviation), and
+# the least α², which keeps a mirror's finite.
+TEXEL_WIDTH, LEAST_ALPHA_SQUARED = 0.4, 1e-6
+LOWEST_Z = -0.95  # of a direction on Lambert's disc, whose border is -1
+GOLDEN = (5**0.5 - 1) / 2  # steps of an even sequence on the circle
+LEAST_COS = 0.02  # between a ray and the screen's axis: 89 degrees
+LEAST_N_V = 1e-3  # n·v of a normal that looks away from the camera
+FAR = 1e3  # coordinates that are outside any image
 
 
 # --- preparation, numpy ---------------------------------------------------------------------------
@@ -65,7 +73,7 @@ def _lobe(cos: Array, roughness: float | None, texel: float = 0.0) -> Array:
     """
     if roughness is None:
         return np.maximum(cos, 0)
-    a2 = roughness**4 + (0.4 * texel) ** 2 + 1e-6
+    a2 = roughness**4 + (TEXEL_WIDTH * texel) ** 2 + LEAST_ALPHA_SQUARED
     h2 = np.clip((1 + cos) / 2, 0, 1)  # cos² of the half vector's angle
     return np.maximum(cos, 0) * a2 / (a2 * h2 + 1 - h2) ** 2
 
@@ -88,7 +96,7 @@ def _disc_lookup(size: int) -> Array:
     """(row, column) in the equirectangular image of each pixel of the disc, (2, size, size)."""
     x = ((np.arange(size) + 0.5) / size * 2 - 1) * SKY_EXTENT
     px, py = np.meshgrid(x, -x)
-    r2 = np.minimum(px**2 + py**2, 1.999)
+    r2 = px**2 + py**2
     theta = np.arccos(np.clip(1 - r2, -1, 1))
     phi = np.arctan2(py, px) % (2 * np.pi)
     return np.stack([theta / np.pi * SKY_ROWS - 0.5, phi / (2 * np.pi) * 2 * SKY_ROWS - 0.5])
@@ -166,7 +174,7 @@ def brdf_table(size: int = 32, samples: int = 4096) -> Tensor:
     Both axes go from 0 to 1. By visible normals with the height-correlated Smith term.
     """
     i = np.arange(samples)
-    u1, u2 = (i * 0.6180339887498949) % 1, (i + 0.5) / samples
+    u1, u2 = (i * GOLDEN) % 1, (i + 0.5) / samples
     sin, cos = np.sin(2 * np.pi * u1), np.cos(2 * np.pi * u1)
     grid = (np.arange(size) + 0.5) / size
     table = np.zeros((2, size, size))
@@ -208,7 +216,7 @@ def reflect(view: Tensor, normal: Tensor) -> Tensor:
 
 def look_up_sky(sky: Tensor, direction: Tensor) -> Tensor:
     """Bilinear look-up of images (B, C, S, S) on the disc along unit directions (B, 3, H, W)."""
-    q = torch.rsqrt(1 + direction[:, 2:].clamp(min=-0.95)) / SKY_EXTENT
+    q = torch.rsqrt(1 + direction[:, 2:].clamp(min=LOWEST_Z)) / SKY_EXTENT
     x, y = direction[:, :1] * q, direction[:, 1:2] * q
     return sample(sky, torch.cat([x, y], 1))
 
@@ -216,7 +224,7 @@ def look_up_sky(sky: Tensor, direction: Tensor) -> Tensor:
 def sample(image: Tensor, position: Tensor, padding: str = "border") -> Tensor:
     """Bilinear look-up of (B, C, h, w) at (B, 2, H, W) in [-1, 1]², x right and y up."""
     # Torch's backward pass writes out of bounds where a coordinate is NaN.
-    at = torch.nan_to_num(position).clamp(-1e3, 1e3)
+    at = torch.nan_to_num(position).clamp(-FAR, FAR)
     return remap(
         image, at[:, 0], -at[:, 1],
         padding_mode=padding, align_corners=False, normalized_coordinates=True,
@@ -232,7 +240,7 @@ def hit_screen(position: Tensor, direction: Tensor, rig: Tensor) -> Tensor:
     x = torch.cat([position, torch.zeros_like(position[:, :1])], 1)
     m = torch.linalg.cross(e_x, e_y, dim=1)
     m = F.normalize(m, dim=1)
-    cos = (direction * m).sum(1, keepdim=True).clamp(min=0.02)
+    cos = (direction * m).sum(1, keepdim=True).clamp(min=LEAST_COS)
     r = ((corner - x) * m).sum(1, keepdim=True) / cos
     p = x + r * direction - corner
     s = (p * e_x).sum(1, keepdim=True) / (e_x * e_x).sum(1, keepdim=True)
@@ -278,7 +286,7 @@ def normal_clues(
     """
     levels = list(dict.fromkeys(rho for rho, _ in basis))
     mirror = reflect(to_camera, normal)
-    n_v = (normal * to_camera).sum(1, keepdim=True).clamp(1e-3, 1)
+    n_v = (normal * to_camera).sum(1, keepdim=True).clamp(LEAST_N_V, 1)
     factors = {rho: brdf_factors(n_v, rho, table) for rho in levels}
     light = look_up_sky(sky[:, : 3 * len(levels)], mirror).chunk(len(levels), 1)
     diffuse = look_up_sky(sky[:, 3 * len(levels) :], normal)

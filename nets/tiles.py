@@ -19,7 +19,7 @@ from nets.batch import PIXELS, Batch
 
 # Pixels a side of a tile, and over which neighbours are blended: four of the network's coarsest
 # cells. Chosen by hand, so that a tile needs little memory and no seam is seen.
-TILE, OVERLAP = 1024, 64
+TILE_SIZE, OVERLAP = 1024, 64
 
 
 @torch.inference_mode()
@@ -63,16 +63,16 @@ def predict(
 
 
 def _starts(length: int) -> list[int]:
-    if length <= TILE:
+    if length <= TILE_SIZE:
         return [0]
-    n = -(-(length - OVERLAP) // (TILE - OVERLAP))
-    return [round(i * (length - TILE) / (n - 1)) for i in range(n)]
+    n = -(-(length - OVERLAP) // (TILE_SIZE - OVERLAP))
+    return [round(i * (length - TILE_SIZE) / (n - 1)) for i in range(n)]
 
 
 def _tiles(height: int, width: int) -> Iterator[tuple[slice, slice]]:
     for y in _starts(height):
         for x in _starts(width):
-            yield slice(y, min(y + TILE, height)), slice(x, min(x + TILE, width))
+            yield slice(y, min(y + TILE_SIZE, height)), slice(x, min(x + TILE_SIZE, width))
 
 
 def _ramp(part: slice, length: int) -> Tensor:
@@ -88,7 +88,7 @@ def tile_folder(
 ) -> Path | None:
     """Where in ``folder`` the tiles of a photo lie, by a digest of the network's notes and of all
     its inputs; None for a photo of one tile, which is not worth keeping."""
-    if max(photo.shape[:2]) <= TILE:
+    if max(photo.shape[:2]) <= TILE_SIZE:
         return None
     digest = hashlib.sha256(json.dumps(notes, sort_keys=True).encode())
     for array in (photo, *inputs):

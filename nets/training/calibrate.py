@@ -19,7 +19,7 @@ from nets.model import MAPS
 from nets.store import AnyNetwork, load_weights, save_weights
 from nets.training.train import errors, validate
 
-SHARE = 0.6827  # of a Gaussian within one standard deviation
+ONE_SIGMA_SHARE = 0.6827  # of a Gaussian within one standard deviation
 
 
 def calibrate(network: AnyNetwork, folders: list[Path], limit: int = 256) -> None:
@@ -33,7 +33,7 @@ def calibrate(network: AnyNetwork, folders: list[Path], limit: int = 256) -> Non
 
 
 def _quantile(ratio: torch.Tensor) -> float:
-    return float(ratio.kthvalue(max(1, int(SHARE * len(ratio)))).values)
+    return float(ratio.kthvalue(max(1, int(ONE_SIGMA_SHARE * len(ratio)))).values)
 
 
 def main() -> None:

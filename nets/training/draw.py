@@ -45,7 +45,7 @@ HELD_OUT = {
     split: Path(__file__).with_name(f"{name}.txt")
     for split, name in (("holdout", "holdout"), ("families", "holdout_families"))
 }
-LARGEST = 512  # pixels a side of a real material, larger ones are shrunk to it
+LARGEST_SIDE = 512  # pixels a side of a real material, larger ones are shrunk to it
 
 SPLITS = ("train", *HELD_OUT)
 
@@ -125,7 +125,7 @@ def _folder_materials(root: str, split: str, fold: str = "") -> tuple[Maps, ...]
     def wanted(folder: Path) -> bool:
         return belongs(folder.name, split) and in_fold(folder.name, fold)
 
-    found = load_materials(Path(root), LARGEST, wanted)
+    found = load_materials(Path(root), LARGEST_SIDE, wanted)
     return tuple(maps for _, maps in found)
 
 

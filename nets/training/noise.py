@@ -15,7 +15,7 @@ from nets.splitsum import area_resize
 
 
 def draw_pattern(rng: np.random.Generator, pattern: Array) -> Array:
-    """The pattern as a screen shows it whose curve and white balance the ball told us."""
+    """The pattern as a screen shows it whose curve and white balance the ball showed."""
     if rng.random() < 0.6:
         return pattern
     curve = 2.2 ** rng.uniform(-1, 1)

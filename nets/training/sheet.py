@@ -31,7 +31,9 @@ Array = NDArray[Any]
 Sample = dict[str, Array]
 
 KIND_SIZE = 128  # pixels a side of a procedural material on a sheet
-BLACK = 1e-3  # of a white plane's radiance: a photo whose 99th percentile is below shows nothing
+BLACK_PHOTO = (
+    1e-3  # of a white plane's radiance: a photo whose 99th percentile is below shows nothing
+)
 CLIPPED = 0.5  # largest share of pixels at the sensor's limit
 FLAT = 1e-4  # least standard deviation of a photo, of its mean
 
@@ -45,14 +47,14 @@ def problems(sample: Sample) -> list[str]:
     if found:
         return found
     photo = sample["photo"].astype(np.float32)
-    if np.percentile(photo, 99) < BLACK:
+    if np.percentile(photo, 99) < BLACK_PHOTO:
         return ["the photo is black"]
     share = clipped_share(photo)
     if share > CLIPPED:
         found.append(f"{share:.0%} of the photo is clipped")
     elif photo.std() < FLAT * photo.mean():
         found.append("the photo is the same everywhere")
-    if np.percentile(sample["ideal"].astype(np.float32), 99) < BLACK:
+    if np.percentile(sample["ideal"].astype(np.float32), 99) < BLACK_PHOTO:
         found.append("the ideal photo is black")
     return found
 

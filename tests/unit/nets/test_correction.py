@@ -18,7 +18,14 @@ from invrender.render.scene import make_scene, make_view  # noqa: E402
 from invrender.rig import Rig  # noqa: E402
 from invrender.sampling import resize  # noqa: E402
 from nets.batch import positions  # noqa: E402
-from nets.correction import ALBEDO_CORRELATION, INPUTS, NOISE, Correction, features, gauss_newton  # noqa: E402
+from nets.correction import (  # noqa: E402
+    ALBEDO_CORRELATION,
+    INPUTS,
+    PHOTO_NOISE,
+    Correction,
+    features,
+    gauss_newton,
+)
 from nets.predict import Corrector, linearised  # noqa: E402
 from nets.scales import Prediction  # noqa: E402
 from nets.store import build, load_weights, save_weights  # noqa: E402
@@ -71,7 +78,7 @@ def test_gauss_newton_is_the_formula():
     j = b["jacobian"][1, :, 2, 3].numpy().reshape(5, 3)
     jacobian = np.concatenate([np.diag(j[0]), np.diag(j[1]), j[2:].T], 1)
     photo = b["photo"][1, :, 2, 3].numpy()
-    noise = np.diag((NOISE[0] * photo) ** 2 + NOISE[1] ** 2)
+    noise = np.diag((PHOTO_NOISE[0] * photo) ** 2 + PHOTO_NOISE[1] ** 2)
     spread = jacobian @ sigma @ correlation @ sigma @ jacobian.T + noise
     r = photo - b["image"][1, :, 2, 3].numpy()
     white = np.linalg.solve(spread, r)
@@ -241,7 +248,7 @@ def test_no_normal_points_below_the_surface(lit, monkeypatch):
 
 
 def test_an_interrupted_run_leaves_the_best_and_goes_on(tmp_path, monkeypatch):
-    monkeypatch.setattr("nets.tiles.TILE", 16)
+    monkeypatch.setattr("nets.tiles.TILE_SIZE", 16)
     monkeypatch.setattr("nets.tiles.OVERLAP", 4)
     forward = Correction.forward
 

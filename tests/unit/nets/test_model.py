@@ -184,7 +184,7 @@ def test_asinh_is_torchs():
 def test_slope_posterior_is_the_formula():
     d, g_p, g_q = torch.randn(3, 1, 3, 4, 4, dtype=torch.float64)
     g = torch.stack([g_p, g_q], -1).permute(0, 2, 3, 1, 4)
-    prior, noise = slopes.SLOPE**2, 0.03**2 + slopes.NOISE**2
+    prior, noise = slopes.SLOPE**2, 0.03**2 + slopes.LOG_NOISE**2
     spread = prior * g @ g.mT + 0.3**2 * torch.ones(3, 3) + noise * torch.eye(3)
     dense = prior * g.mT @ torch.linalg.solve(spread, d.permute(0, 2, 3, 1)[..., None])
     torch.testing.assert_close(
@@ -465,7 +465,7 @@ def test_inference_without_a_room_or_with_a_bad_photo(reconstructor):
 
 
 def test_tiles_cover_and_blend(reconstructor, lights, monkeypatch):
-    monkeypatch.setattr("nets.tiles.TILE", 64)
+    monkeypatch.setattr("nets.tiles.TILE_SIZE", 64)
     monkeypatch.setattr("nets.tiles.OVERLAP", 16)
     covered = np.zeros((100, 150), int)
     for rows, columns in _tiles(100, 150):
