@@ -20,6 +20,7 @@ from invrender.types import Array, InputError
 
 Vec3 = tuple[float, float, float]
 LONGEST = 1e6  # of any length, in whatever unit
+BALL_SHAPES = ("hemisphere", "sphere")
 _LENGTHS = ("_size", "_height", "_offset", "_radius", "_shift")
 
 
@@ -27,6 +28,7 @@ _LENGTHS = ("_size", "_height", "_offset", "_radius", "_shift")
 class Rig:
     """Sizes in metres, angles in degrees. The defaults are a tablet and a 19 mm ball.
 
+    ``ball_shape``: a "hemisphere" has its flat side on the table, a "sphere" stands on the table.
     ``screen_shift`` and ``screen_tilt`` (a rotation vector about the screen's centre), and the
     same for the camera, say how a hand-held rig differs from the nominal one.
     """
@@ -37,14 +39,17 @@ class Rig:
     ball_radius: float = 0.0095
     fov: float = 73.7
     ball_reflectance: Vec3 = (0.9, 0.9, 0.9)
+    ball_shape: str = "hemisphere"
     screen_shift: Vec3 = (0.0, 0.0, 0.0)
     screen_tilt: Vec3 = (0.0, 0.0, 0.0)
     camera_shift: Vec3 = (0.0, 0.0, 0.0)
     camera_tilt: Vec3 = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
+        if self.ball_shape not in BALL_SHAPES:
+            raise InputError(f"rig: ball shape must be one of {', '.join(BALL_SHAPES)}")
         for f in fields(self):
-            if not np.all(np.isfinite(getattr(self, f.name))):
+            if f.name != "ball_shape" and not np.all(np.isfinite(getattr(self, f.name))):
                 raise InputError(f"rig: {f.name} must be finite")
         for name in ("screen_size", "ball_radius"):
             if not getattr(self, name) > 0:
@@ -159,8 +164,13 @@ class Rig:
 
     @property
     def ball_centre(self) -> Array:
-        """Centre of the mirror (hemi)sphere, on the table below the nominal camera."""
-        return np.array([self.optical_axis_x, 0.0, 0.0])
+        """Centre of the mirror ball below the nominal camera: a hemisphere's lies on the table, a
+        sphere's its radius above."""
+        return np.array([self.optical_axis_x, 0.0, self.ball_height(self.ball_radius)])
+
+    def ball_height(self, radius: float) -> float:
+        """Height of the centre of a ball of that radius above the table, in metres."""
+        return radius if self.ball_shape == "sphere" else 0.0
 
     def turned(self, turn: Rotation, centre: Array) -> Rig:
         """Camera and screen turned about a point (3,); the ball's nominal place stays."""

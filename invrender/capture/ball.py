@@ -19,11 +19,20 @@ from scipy import ndimage, optimize
 
 from invrender.capture.ball_rim import fit_rim
 from invrender.capture.ball_view import View, horizon_curve, normals, outline_curve, view_around
-from invrender.capture.mirror import Ball, is_whole, make_ball, mirror_normals, on_table, place_ball
+from invrender.capture.mirror import (
+    Ball,
+    ball_centre,
+    is_whole,
+    make_ball,
+    mirror_normals,
+    on_table,
+    place_ball,
+)
+from invrender.capture.robust import spread
 from invrender.capture.settings import BALL_SEARCH, BALL_VIEW, MIRRORED_TABLE, RIM_FIT, TINY
 from invrender.files.images import Photo
 from invrender.rig import Rig
-from invrender.types import Array, InputError, Mask
+from invrender.types import Array, InputError, Mask, Vec3
 
 __all__ = ["Ball", "find_ball", "make_ball", "mirror_normals", "place_ball"]
 
@@ -34,11 +43,13 @@ def find_ball(
     manual: tuple[float, float, float] | None = None,
     tilt_deviation: float = RIM_FIT.tilt_deviation,
 ) -> Ball:
-    """Find the mirror hemisphere in a photo; the rig says how big it is and about where.
+    """Find the mirror ball in a photo; the rig gives its shape, its size and about its place.
 
     Every place within `BALL_SEARCH.reach` radii of where the rig puts it is scored by how well the
     image's edges run along the horizon's and the outline's curves there; the best few are refined
-    and the best of these is kept. ``manual`` (x, y, r) in pixels overrides the search.
+    and the best of these is kept. The mirror's reflectance need not be known: at each place it is
+    measured, from the table seen in the ball against the same table seen directly, and the rig's is
+    used only where the photo agrees with it. ``manual`` (x, y, r) in pixels overrides the search.
     ``tilt_deviation``: the expected error of the camera's tilt, degrees. Raises `InputError` where
     no ball is found with enough confidence, or where it is cut off, saturated or too small.
     """
@@ -46,7 +57,7 @@ def find_ball(
     if manual is not None:
         ball = place_ball(rig, size, *manual)
         _check_exposure(photo, ball)
-        return ball
+        return measure_reflectance(photo, rig, ball)
     expected = make_ball(rig, rig.ball_centre, rig.ball_radius, size)
     if expected.radius < BALL_SEARCH.least_radius:
         raise InputError(
@@ -58,17 +69,23 @@ def find_ball(
         raise InputError("the rig puts the ball outside the photo: check its lengths and its tilt")
     reach = (BALL_SEARCH.reach + BALL_SEARCH.view_margin) * expected.radius
     view = view_around(photo, middle, reach, expected.radius / BALL_SEARCH.view_radius)
-    candidates = sorted(
-        _coarse(view, rig, expected), key=lambda c: -_score(view, rig, c, 64, 2)[0]
-    )[: BALL_SEARCH.candidates]
-    climbed = [_climb(view, rig, c, *BALL_SEARCH.climb_first) for c in candidates]
+
+    def score(circle: Array, blur: int) -> float:
+        return _score(view, _with_reflectance(view, rig, circle, blur)[0], circle, 64, blur)[0]
+
+    def climb(circle: Array, reach: float, blur: int, evaluations: int) -> Array:
+        mirror, _ = _with_reflectance(view, rig, circle, blur)
+        return _climb(view, mirror, circle, reach, blur, evaluations)
+
+    candidates = sorted(_coarse(view, rig, expected), key=lambda c: -score(c, 2))
+    climbed = [climb(c, *BALL_SEARCH.climb_first) for c in candidates[: BALL_SEARCH.candidates]]
     if not climbed:
         raise InputError("no mirror ball found: the photo shows nothing where the rig puts it")
-    climbed.sort(key=lambda c: -_score(view, rig, c, 64, 1)[0])
+    climbed.sort(key=lambda c: -score(c, 1))
 
     def finer(circle: Array) -> Array:
-        for climb in BALL_SEARCH.climbs:
-            circle = _climb(view, rig, circle, *climb)
+        for settings in BALL_SEARCH.climbs:
+            circle = climb(circle, *settings)
         return circle
 
     def circles() -> Iterator[Array]:
@@ -100,7 +117,62 @@ def find_ball(
     if not is_whole(size, x, y, r):
         raise InputError(f"the mirror ball at {x:.0f}, {y:.0f} is cut off by the edge of the photo")
     _check_exposure(photo, ball)
-    return ball
+    return measure_reflectance(photo, rig, ball)
+
+
+def measure_reflectance(photo: Photo, rig: Rig, ball: Ball) -> Ball:
+    """The ball with its mirror's reflectance and that logarithm's standard deviation, by the table
+    seen in it against the table seen directly; without, where the photo shows too little of it."""
+    reach = (BALL_SEARCH.reach + BALL_SEARCH.view_margin) * ball.radius
+    view = view_around(photo, np.asarray(ball.centre), reach, ball.radius / BALL_SEARCH.view_radius)
+    circle = np.array([*ball.position[:2], ball.radius_m])
+    reflectance, deviation = _measured_reflectance(view, rig, circle)
+    if reflectance is None:
+        return ball
+    return replace(ball, reflectance=reflectance, reflectance_deviation=deviation)
+
+
+def _with_reflectance(view: View, rig: Rig, circle: Array, blur: int = 0) -> tuple[Rig, float]:
+    """The rig with the reflectance that the ball's image shows, where that contradicts the rig's;
+    and the expected error of its logarithm."""
+    measured, deviation = _measured_reflectance(view, rig, circle, blur)
+    if measured is None or agrees(rig.ball_reflectance, measured, deviation):
+        return rig, RIM_FIT.reflectance_deviation
+    return replace(rig, ball_reflectance=measured), deviation
+
+
+def agrees(nominal: Vec3, measured: Vec3, deviation: float) -> bool:
+    """Whether a measured reflectance, its logarithm having that deviation, allows the nominal."""
+    off = np.abs(np.log(measured) - np.log(nominal)).max()
+    allowed = max(MIRRORED_TABLE.contradiction * deviation, MIRRORED_TABLE.least_contradiction)
+    return bool(off <= allowed)
+
+
+def _measured_reflectance(
+    view: View, rig: Rig, circle: Array, blur: int = 0
+) -> tuple[Vec3 | None, float]:
+    """The mirror's reflectance (RGB), limited to what mirrors have, and its logarithm's deviation.
+
+    Each point of the ring gives a ratio of radiances; the middle of their shortest half (of the
+    logarithms) is taken, which glare over less than half of the ring does not move.
+    """
+    seen, table, distance, valid = _table_both_ways(view, rig, circle, blur)
+    near, far = MIRRORED_TABLE.measured
+    dark = TINY + BALL_VIEW.least_level
+    use = valid & (distance > near) & (distance < far) & (table > dark).all(-1)
+    use &= (seen > dark).all(-1)
+    if use.sum() < MIRRORED_TABLE.least_share * len(use) / 2:
+        return None, math.inf
+    ratios = np.sort(np.log(seen[use]) - np.log(table[use]), 0)
+    count = len(ratios) // 2
+    width = ratios[count:] - ratios[: len(ratios) - count]
+    first = np.argmin(width, 0)
+    middle = np.array([np.median(ratios[i : i + count, c]) for c, i in enumerate(first)])
+    error = float(spread(ratios - middle)) / math.sqrt(MIRRORED_TABLE.independent)
+    grey = float(np.clip(middle.mean(), *np.log(MIRRORED_TABLE.reflectances)))
+    tint = np.clip(middle - middle.mean(), -MIRRORED_TABLE.tint, MIRRORED_TABLE.tint)
+    red, green, blue = np.minimum(np.exp(grey + tint), 1).tolist()
+    return (red, green, blue), math.hypot(error, MIRRORED_TABLE.least_deviation)
 
 
 def _fit(
@@ -111,19 +183,28 @@ def _fit(
     The ball is the one that the untilted camera would see like that.
     """
     size = (photo.height, photo.width)
-    found = make_ball(rig, np.array([circle[0], circle[1], 0.0]), circle[2], size)
+    found = make_ball(rig, ball_centre(rig, circle), circle[2], size)
     reach = BALL_SEARCH.fit_reach * found.radius
     fine = view_around(
         photo, np.asarray(found.centre), reach, found.radius / BALL_SEARCH.fit_radius
     )
-    rim = fit_rim(fine, rig, circle, thorough, tilt_deviation)
+    mirror, deviation = _with_reflectance(view, rig, circle)
+    rim = fit_rim(fine, mirror, circle, thorough, tilt_deviation, deviation)
     relative = BALL_SEARCH.radius_error / max(rim.deviation, TINY)
     doubt = BALL_SEARCH.doubt / (1 + relative**2)
-    confidence = _confidence(view, rim.rig, rim.circle) * (1 - doubt)
-    ball = make_ball(rim.rig, np.array([*rim.circle[:2], 0.0]), rim.circle[2], size)
+    measured, _ = _with_reflectance(
+        view, replace(rim.rig, ball_reflectance=rig.ball_reflectance), rim.circle
+    )
+    confidence = _confidence(view, measured, rim.circle) * (1 - doubt)
+    ball = make_ball(rim.rig, ball_centre(rim.rig, rim.circle), rim.circle[2], size)
     if is_whole(size, *ball.centre, ball.radius):
         ball = place_ball(rig, size, *ball.centre, ball.radius)
-    return replace(ball, confidence=confidence, camera_tilt=rim.rig.camera_tilt)
+    return replace(
+        ball,
+        confidence=confidence,
+        camera_tilt=rim.rig.camera_tilt,
+        tilt_deviation=rim.tilt_deviation,
+    )
 
 
 def _distance(a: Ball, b: Ball) -> float:
@@ -173,13 +254,17 @@ def _score(
 
 
 @cache
-def _ring() -> tuple[Array, Array]:
+def _ring(height: float) -> tuple[Array, Array]:
     """Normals (n, 3) of the part of a ball that mirrors the table near it, and for each the blur
-    level of a view that fits how much the mirror shrinks the table there."""
+    level of a view that fits how much the mirror shrinks the table there.
+
+    height: of the ball's centre above the table, in radii.
+    """
     around = MIRRORED_TABLE.around
     sine = np.linspace(*MIRRORED_TABLE.sines)
     beta = np.arcsin(sine)
-    reach = sine + np.cos(beta) / np.tan(2 * beta - np.pi / 2)  # distance on the table, in radii
+    # Distance on the table, in radii, for rays from straight above.
+    reach = sine + (height + np.cos(beta)) / np.tan(2 * beta - np.pi / 2)
     shrink = np.maximum(-np.gradient(reach, sine), 1)
     level = np.clip(np.log2(shrink), 0, MIRRORED_TABLE.deepest_level)
     psi = np.arange(around) * (2 * np.pi / around)
@@ -214,22 +299,33 @@ def _mirror_difference(view: View, rig: Rig, circle: Array, blur: int = 0) -> tu
     there, times the mirror's reflectance, should be the photo here. The mask (n,) says where the
     photo shows that point of the table. Both are blurred by ``blur`` levels more than need be.
     """
-    normal, level = _ring()
+    seen, table, _, valid = _table_both_ways(view, rig, circle, blur)
+    expected = table * np.asarray(rig.ball_reflectance)
+    return np.log(seen + BALL_VIEW.toe) - np.log(expected + BALL_VIEW.toe), valid
+
+
+def _table_both_ways(
+    view: View, rig: Rig, circle: Array, blur: int
+) -> tuple[Array, Array, Array, Mask]:
+    """Radiance (n, 3) of the ring's points in the ball and of the table that they mirror, that
+    table's distance from the ball's centre in radii (n,), and whether the photo shows it."""
+    normal, level = _ring(rig.ball_height(1.0))
     level = np.minimum(level + blur, len(BALL_VIEW.blurs) - 1)
     point, rise, at = _mirrored_table(rig, circle, normal)
-    table = view.at(at, rig)
+    distance = np.hypot(*(at[:, :2] - circle[:2]).T) / circle[2]
+    place = view.at(at, rig)
     h, w = view.tone.shape[:2]
-    valid = (rise < -MIRRORED_TABLE.downward) & (table > 0).all(-1) & (table < [w, h]).all(-1)
-    table = np.where(valid[:, None], table, 0)
-    expected = _look_up(view.levels, level, table) * np.asarray(rig.ball_reflectance)
+    valid = (rise < -MIRRORED_TABLE.downward) & (place > 0).all(-1) & (place < [w, h]).all(-1)
+    place = np.where(valid[:, None], place, 0)
+    table = _look_up(view.levels, level, place)
     seen = _look_up(view.levels, np.full_like(level, blur), view.at(point, rig))
-    return np.log(seen + BALL_VIEW.toe) - np.log(expected + BALL_VIEW.toe), valid
+    return seen, table, distance, valid
 
 
 def _mirrored_table(rig: Rig, circle: Array, normal: Array) -> tuple[Array, Array, Array]:
     """Points (..., 3) of the ball with these normals, the z of the ray that each mirrors, and where
     that meets the table, (..., 3)."""
-    point = np.array([circle[0], circle[1], 0.0]) + circle[2] * normal
+    point = ball_centre(rig, circle) + circle[2] * normal
     ray = point - rig.camera
     ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
     mirrored = ray - 2 * np.sum(ray * normal, -1, keepdims=True) * normal
@@ -294,7 +390,8 @@ def _coarse(view: View, rig: Rig, expected: Ball) -> list[Array]:
             continue
         places.append((x, y, radius))
         pixel = np.array([x, y]) * view.step + view.origin
-        at = on_table(rig, view.size, float(pixel[0]), float(pixel[1]))
+        height = rig.ball_height(radius)
+        at = on_table(rig, view.size, float(pixel[0]), float(pixel[1]), height)
         chosen.append(np.array([at[0], at[1], radius]))
         if len(chosen) == BALL_SEARCH.kept:
             break

@@ -1,9 +1,10 @@
 """The ball to some hundredths of a pixel: its rim against the table that it mirrors.
 
-The hemisphere's centre lies on the table. So a plane through the camera and that centre holds the
-whole way of its rays: the photo shows it as one line, what the ball mirrors stays in it, and it
-cuts the table in a line through the centre. On each such line the table outside the ball and its
-image inside are one unknown function of the distance from the centre. Near the ball it is solved
+A plane through the camera and the ball's centre holds the whole way of its rays: the photo shows
+it as one line, what the ball mirrors stays in it, and it cuts the table in a line through one
+point: the foot, where the line from the camera through the centre meets the table. (A hemisphere's
+centre is its own foot.) On each such line the table outside the ball and its image inside are one
+unknown function of the distance from the foot. Near the ball it is solved
 for by linear least squares, at every step anew (variable projection: Golub and Pereyra 1973, with
 Kaufman's derivative, 1975); farther out the photo shows it. The ball is where the residuals are
 least: at its outline the radiance drops by the mirror's reflectance, and inside it runs backwards.
@@ -24,6 +25,7 @@ from scipy import ndimage
 
 from invrender.capture.ball_image import sample_image
 from invrender.capture.ball_view import View, edges, horizon_curve, normals, outline_curve
+from invrender.capture.mirror import ball_centre
 from invrender.capture.robust import spread as robust_spread
 from invrender.capture.settings import LUMINANCE, RIM_FIT, TINY
 from invrender.rig import Rig
@@ -38,12 +40,14 @@ _TILT, _BLUR, _MIRROR = slice(3, 5), 5, 6
 class Rim:
     """``circle``: x, y, radius in metres in ``rig``, whose camera is tilted as fitted.
 
-    ``deviation``: what the fit expects of the radius, relative (a standard deviation).
+    ``deviation``: what the fit expects of the radius's error, relative (a standard deviation);
+    ``tilt_deviation``: the same of the camera's tilt in its worst direction, degrees.
     """
 
     circle: Array
     rig: Rig
     deviation: float
+    tilt_deviation: float
 
 
 def fit_rim(
@@ -52,6 +56,7 @@ def fit_rim(
     circle: Array,
     thorough: bool = True,
     tilt_deviation: float = RIM_FIT.tilt_deviation,
+    reflectance_deviation: float = RIM_FIT.reflectance_deviation,
 ) -> Rim:
     """The ball near ``circle``: x, y, radius in metres, some hundredths of the radius off.
 
@@ -59,12 +64,14 @@ def fit_rim(
     Marquardt's steps, coarse to fine, with Cauchy's weights on the lines' residuals and on the
     distances from the horizon to the strongest edges near it. ``thorough``: from all of a stage's
     starts, not only from those that fit best as they are. ``tilt_deviation``: expected error of the
-    rig's camera tilt, degrees.
+    rig's camera tilt, degrees. ``reflectance_deviation``: of the logarithm of the rig's mirror.
     """
     p = np.array([*circle, 0.0, 0.0, math.log(RIM_FIT.expected_blur), 0.0])
     light = _without_outliers(view.image @ np.array(LUMINANCE, np.float32))
     for count, blur, limit, turns, scales in RIM_FIT.stages:
-        lines = _Lines(view, light, rig, p, count, blur, limit, tilt_deviation)
+        lines = _Lines(
+            view, light, rig, p, count, blur, limit, tilt_deviation, reflectance_deviation
+        )
         starts = [p * [1, 1, k, 1, 1, 1, 1] for k in scales]
         spread, edge = np.min([lines.spreads(q) for q in starts], axis=0)
         if len(starts) > RIM_FIT.starts and not thorough:
@@ -72,8 +79,9 @@ def fit_rim(
             starts = [starts[i] for i in np.argsort(costs)[: RIM_FIT.starts]]
         found = [lines.descend(q, turns, spread, edge) for q in starts]
         _, p, information = min(found, key=lambda f: f[0])
-    spread = math.sqrt(np.linalg.inv(information)[2, 2])
-    return Rim(p[:3], _tilted(rig, p), spread * float(lines.units[2, 2] / p[2]))
+    covariance = lines.units.T @ np.linalg.inv(information) @ lines.units
+    tilt = math.sqrt(float(np.linalg.eigvalsh(covariance[_TILT, _TILT])[-1]))
+    return Rim(p[:3], _tilted(rig, p), math.sqrt(covariance[2, 2]) / float(p[2]), tilt)
 
 
 def _tilted(rig: Rig, p: Array) -> Rig:
@@ -94,10 +102,11 @@ def _single(x: Any) -> Array:
 class _Trace:
     """What the points of the lines see, (lines, points).
 
-    ``mirrored`` and ``direct``: where they see the table, in radii from the ball's centre, by the
-    mirror and past it; ``inside``: their share of the ball; ``far``: the table's radiance where it
-    is mirrored from beyond the unknown part; ``hidden``: where the photo does not show that.
-    ``seen``: (lines, samples), the photo along the lines.
+    ``mirrored`` and ``direct``: where they see the table, by the mirror and past it, as distances
+    from the foot over that at which the ball's outline hides it, about one radius; ``inside``:
+    their share of the ball; ``far``: the table's radiance where it is mirrored from beyond the
+    unknown part; ``hidden``: where the photo does not show that. ``seen``: (lines, samples), the
+    photo along the lines.
     """
 
     mirrored: Array
@@ -133,7 +142,7 @@ class _Lines:
 
     def __init__(
         self, view: View, light: Array, rig: Rig, p: Array, count: int, blur: float, limit: float,
-        tilt_deviation: float,
+        tilt_deviation: float, reflectance_deviation: float = RIM_FIT.reflectance_deviation,
     ) -> None:  # fmt: skip
         self.view, self.rig, self.blur, self.limit = view, rig, blur, limit
         self.light = ndimage.gaussian_filter(light, blur) if blur else light
@@ -156,22 +165,24 @@ class _Lines:
         self.units = np.diag(steps)
         aim = steps[3] * rig.camera[2] * math.radians(1)
         self.units[3, 1], self.units[4, 0] = aim, -aim
-        deviation = [tilt_deviation] * 2 + [RIM_FIT.blur_deviation, RIM_FIT.reflectance_deviation]
+        deviation = [tilt_deviation] * 2 + [RIM_FIT.blur_deviation, reflectance_deviation]
         self.prior = np.array([RIM_FIT.position_precision] * 3 + [1 / d**2 for d in deviation])
         self.expected = np.array([0, 0, 0, 0, 0, math.log(RIM_FIT.expected_blur), 0])
 
     def trace(self, p: Array) -> _Trace:
-        """Rays in the planes of the lines: x along the table, from the ball's centre; y up."""
+        """Rays in the planes of the lines: x along the table, from the foot; y up."""
         rig, view, radius = _tilted(self.rig, p), self.view, p[2]
-        centre = np.array([p[0], p[1], 0.0])
-        to_camera = rig.camera - centre
+        centre = ball_centre(rig, p)
+        share = centre[2] / rig.camera[2]  # of the way from the foot to the camera
+        foot = (centre - share * rig.camera) / (1 - share)
+        to_camera = rig.camera - foot
         camera_x = self.along @ to_camera
         up = to_camera - camera_x[:, None] * self.along
         camera_y = np.sqrt((up * up).sum(-1))
         up /= camera_y[:, None]
         # A view's position is linear in the ray (x, y, -1) of the camera.
         middle = view.at(centre, rig)
-        line = view.at(centre + RIM_FIT.toward * radius * self.along, rig) - middle
+        line = view.at(foot + RIM_FIT.toward * radius * self.along, rig) - middle
         line /= np.sqrt((line * line).sum(-1))[:, None]
         focal = rig.focal(view.size[1]) / view.step
         start = -to_camera / (to_camera @ rig.camera_axes[2])
@@ -183,17 +194,22 @@ class _Lines:
         length = np.sqrt(ray_x * ray_x + ray_y * ray_y)
         ray_x, ray_y = ray_x / length, ray_y / length
         # In radii: the ray's moment about the centre, and half its way through the circle.
-        moment = _single(camera_x / radius)[:, None] * ray_y
-        moment -= _single(camera_y / radius)[:, None] * ray_x
+        from_centre = (1 - share) / radius
+        moment = _single(from_centre * camera_x)[:, None] * ray_y
+        moment -= _single(from_centre * camera_y)[:, None] * ray_x
         half = np.sqrt(np.maximum(1 - moment * moment, 0))
         direct = np.abs(moment / ray_y)
         x, y = moment * ray_y - half * ray_x, -moment * ray_x - half * ray_y
         back_x, back_y = ray_x + 2 * half * x, ray_y + 2 * half * y
+        # From the centre's to the foot's coordinates; where it is a hemisphere, nothing changes.
+        x, y = (q + _single(share * c / radius)[:, None] for q, c in ((x, camera_x), (y, camera_y)))
         mirrored = np.abs(x - back_x * (y / np.minimum(back_y, -RIM_FIT.least_downward)))
+        mirrored *= np.float32(1 - share)
         mirrored[back_y > -RIM_FIT.downward] = np.inf
-        # The outline: where a ray touches the circle, or the rim on the table, if it is seen.
-        touch = np.arctan2(camera_y, camera_x) - np.arccos(radius / np.hypot(camera_x, camera_y))
-        touch = np.maximum(touch, 0)[:, None]
+        # The outline: where a ray touches the circle, or a hemisphere's rim, if that is seen.
+        cosine = 1 / (from_centre * np.hypot(camera_x, camera_y))
+        touch = np.arctan2(camera_y, camera_x) - np.arccos(cosine)
+        touch = (touch if share else np.maximum(touch, 0))[:, None]
         edge = np.cos(touch) * self.along + np.sin(touch) * up
         outline = view.at(centre + radius * edge, rig) - middle
         outline = np.sqrt((outline * outline).sum(-1))[:, None]
@@ -203,8 +219,8 @@ class _Lines:
         seen = sample_image(self.light, middle + self.samples[:, None] * line[:, None])
         beyond = (mirrored > self.limit) & (inside > 0)
         far, hidden = np.zeros_like(mirrored), np.zeros(beyond.shape, bool)
-        reach = np.minimum(mirrored[beyond], RIM_FIT.farthest) * radius
-        place = view.at(centre + reach[:, None] * self.along[np.nonzero(beyond)[0]], rig)
+        reach = np.minimum(mirrored[beyond], RIM_FIT.farthest) / from_centre
+        place = view.at(foot + reach[:, None] * self.along[np.nonzero(beyond)[0]], rig)
         shown = (place > 0).all(-1) & (place < self.light.shape[::-1]).all(-1)
         hidden[beyond] = ~shown | (mirrored[beyond] > RIM_FIT.farthest)
         far[beyond] = sample_image(self.farther, place)

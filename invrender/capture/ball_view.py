@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from scipy import ndimage
 
-from invrender.capture.mirror import horizon_points, outline_points
+from invrender.capture.mirror import ball_centre, horizon_points, outline_points
 from invrender.capture.settings import BALL_VIEW, TINY
 from invrender.files.images import Photo
 from invrender.rig import Rig
@@ -91,16 +91,12 @@ def view_around(photo: Photo, middle: Array, reach: float, shrink: float) -> Vie
 
 def horizon_curve(view: View, rig: Rig, circle: Array, count: int) -> Array:
     """The image of the horizon in the ball, view positions (count, 2)."""
-    return view.at(horizon_points(rig, _centre(circle), circle[2], count), rig)
+    return view.at(horizon_points(rig, ball_centre(rig, circle), circle[2], count), rig)
 
 
 def outline_curve(view: View, rig: Rig, circle: Array, count: int) -> Array:
     """The ball's outline, view positions (count, 2)."""
-    return view.at(outline_points(rig, _centre(circle), circle[2], count), rig)
-
-
-def _centre(circle: Array) -> Array:
-    return np.array([circle[0], circle[1], 0.0])
+    return view.at(outline_points(rig, ball_centre(rig, circle), circle[2], count), rig)
 
 
 def normals(curve: Array) -> Array:

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
+from invrender.capture.ball import agrees
 from invrender.capture.ball_image import BallImage, trace_image, unfold_pattern
 from invrender.capture.camera import find_camera
 from invrender.capture.clipped_lamps import raise_clipped
@@ -67,13 +68,14 @@ def find_lights(
         return FoundLights(capture, lights, None, capture.warnings)
     # The matrices are small: more threads than one only slow each other down.
     with threadpool_limits(1, "blas"):
-        capture, found, notices = find_ball_and_orientation(capture, ball)
+        capture, found, turned = find_ball_and_orientation(capture, ball)
+        capture, mirror = use_reflectance(capture, found)
         lights = measure_lights(capture, found)
     if environment is not None:
         lights = replace(lights, environment=environment)
     if gain is not None:
         lights = replace(lights, gain=_rgb(gain))
-    notices = (*capture.warnings, *notices, *light_warnings(lights))
+    notices = (*capture.warnings, *turned, *mirror, *light_warnings(lights))
     return FoundLights(capture, lights, found, notices)
 
 
@@ -86,6 +88,32 @@ def known_lights(capture: Capture, environment: Array, gain: Any) -> Lights:
 
 def _rgb(gain: Any) -> Array:
     return np.broadcast_to(np.asarray(gain, np.float32), 3).copy()
+
+
+def use_reflectance(capture: Capture, ball: Ball) -> tuple[Capture, tuple[Notice, ...]]:
+    """The capture with the ball's reflectance as measured, where nobody states it and the photo
+    contradicts the default; and what a person should know of it.
+
+    A stated reflectance is used, and doubted where the photo contradicts it.
+    """
+    measured, deviation = ball.reflectance, ball.reflectance_deviation
+    nominal = capture.rig.ball_reflectance
+    if measured is None or deviation is None or agrees(nominal, measured, deviation):
+        return capture, ()
+    found = f"{np.mean(measured):.0%} of the light, ± {deviation:.0%} of that"
+    if "ball_reflectance" not in capture.unknown:
+        text = (
+            f"by the table in it the ball reflects {found}, but rig.toml says "
+            f"{np.mean(nominal):.0%}, which was used: check [ball] reflectance; albedo scales with "
+            "it"
+        )
+        return capture, (Notice("ball-reflectance-doubtful", text),)
+    text = (
+        f"the ball reflects {found}, by the table in it, and albedo scales with that: set [ball] "
+        "reflectance in rig.toml if you know it better"
+    )
+    rig = replace(capture.rig, ball_reflectance=measured)
+    return replace(capture, rig=rig), (Notice("ball-reflectance-measured", text),)
 
 
 def measure_lights(capture: Capture, ball: Ball, height: int = UNFOLDING.height) -> Lights:
@@ -108,6 +136,9 @@ def measure_lights(capture: Capture, ball: Ball, height: int = UNFOLDING.height)
         or fit["screen_tilt"] > PATTERN_CHECK.least_tilt
     ):
         rig = screen.rig
+    fit["ball_reflectance"] = float(np.mean(rig.ball_reflectance))
+    known = "ball_reflectance" not in capture.unknown
+    fit["ball_reflectance_deviation"] = 0.0 if known else ball.reflectance_deviation or 0.0
     fit["room_saturated"] = _room_saturated(photo, rig, image)
     environment, coverage = unfold_environment(photo, rig, image, height, screen.blur)
     environment, fit["room_raised"] = raise_clipped(
@@ -129,13 +160,15 @@ def level_table(photo: Photo, rig: Rig, ball: Ball) -> Rig:
     A camera that does not look straight down sees the horizon's image off the ball's middle. A
     photo cannot tell a turned camera from a turned table: camera and screen are turned together
     about the ball's centre, so that the ball stays where it is and what the camera sees of the
-    screen too. A tilt that the rig gives is kept, and one below `TABLE_LEVEL.least_tilt` is not
-    believed; a JPEG's rounding hides the horizon too well.
+    screen too. A tilt that the rig gives is kept. One is not believed below
+    `TABLE_LEVEL.least_tilt`, or where it is not several times its expected error, or in a JPEG,
+    whose rounding hides the horizon, or by a full sphere, whose horizon lies beside the far table.
     """
     tilt = ball.camera_tilt
     if tilt is None or any(rig.camera_tilt) or photo.clip_level is not None:
         return rig
-    if np.linalg.norm(tilt) < TABLE_LEVEL.least_tilt:
+    error = TABLE_LEVEL.least_deviations * (ball.tilt_deviation or 0.0)
+    if rig.ball_shape == "sphere" or np.linalg.norm(tilt) < max(TABLE_LEVEL.least_tilt, error):
         return rig
     return rig.turned(Rotation.from_rotvec(tilt, degrees=True), np.asarray(ball.position))
 

@@ -13,13 +13,17 @@ from invrender.types import Array, InputError
 
 @dataclass(frozen=True)
 class Ball:
-    """A mirror hemisphere standing on the table, as a photo of `size` (H, W) pixels shows it.
+    """A mirror ball standing on the table, as a photo of `size` (H, W) pixels shows it.
 
-    ``position`` (3,) and ``radius_m`` in metres, in the rig's coordinates (z = 0). ``centre``
+    ``position`` (3,) of its centre and ``radius_m`` in metres, in the rig's coordinates: z = 0 for
+    a hemisphere, z = ``radius_m`` for a full sphere. ``centre``
     (x, y) and ``radius`` are those of its outline in pixels (0, 0 is the photo's corner);
     ``ellipse`` is the outline's (centre x, centre y, semi-axis a, semi-axis b, angle of a in
     degrees from the photo's right towards down). ``confidence`` is in [0, 1]. ``camera_tilt``: the
-    camera's, degrees as `Rig` has them, where the ball's rim tells it.
+    camera's, degrees as `Rig` has them, where the ball's rim determines it, and ``tilt_deviation``
+    the expected error. ``reflectance`` (RGB)
+    and ``reflectance_deviation``, the standard deviation of its logarithm: as measured, where it
+    was.
     """
 
     position: tuple[float, float, float]
@@ -30,6 +34,9 @@ class Ball:
     ellipse: tuple[float, float, float, float, float]
     confidence: float = 1.0
     camera_tilt: tuple[float, float, float] | None = None
+    tilt_deviation: float | None = None
+    reflectance: tuple[float, float, float] | None = None
+    reflectance_deviation: float | None = None
 
 
 def mirror_normals(rig: Rig, position: Array, radius: float, target: Array, near: bool) -> Array:
@@ -55,10 +62,10 @@ def _unit(v: Array) -> Array:
 
 
 def outline_points(rig: Rig, position: Array, radius: float, count: int = 128) -> Array:
-    """Points in space (count, 3) on the hemisphere's outline as the camera sees it.
+    """Points in space (count, 3) on the ball's outline as the camera sees it.
 
-    The circle where rays from the camera touch the sphere, or the hemisphere's rim on the table
-    where that circle runs below it.
+    The circle where rays from the camera touch the sphere, or a hemisphere's rim on the table where
+    that circle runs below it.
     """
     axis = position - rig.camera
     d = float(np.linalg.norm(axis))
@@ -116,13 +123,14 @@ def place_ball(rig: Rig, size: tuple[int, int], x: float, y: float, r: float) ->
             f"ball: the circle {x:.0f}, {y:.0f}, {r:.0f} is not whole inside the "
             f"{size[1]} × {size[0]} photo"
         )
-    position, radius = on_table(rig, size, x, y), rig.ball_radius
+    radius = rig.ball_radius
+    position = on_table(rig, size, x, y, rig.ball_height(radius))
     for _ in range(6):
         ball = make_ball(rig, position, radius, size)
         radius *= r / ball.radius
         shift = np.array([x - ball.centre[0], y - ball.centre[1]])
         at = rig.project(position, *size) + shift
-        position = on_table(rig, size, float(at[0]), float(at[1]))
+        position = on_table(rig, size, float(at[0]), float(at[1]), rig.ball_height(radius))
     return make_ball(rig, position, radius, size)
 
 
@@ -131,12 +139,17 @@ def is_whole(size: tuple[int, int], x: float, y: float, r: float) -> bool:
     return r <= x <= size[1] - r and r <= y <= size[0] - r
 
 
-def on_table(rig: Rig, size: tuple[int, int], x: float, y: float) -> Array:
-    """The point (3,) of the table, z = 0, that pixel (x, y) of a photo of that size sees."""
+def ball_centre(rig: Rig, circle: Array) -> Array:
+    """Centre (3,) of the ball with that circle: x, y and radius in metres."""
+    return np.array([circle[0], circle[1], rig.ball_height(circle[2])])
+
+
+def on_table(rig: Rig, size: tuple[int, int], x: float, y: float, height: float = 0.0) -> Array:
+    """The point (3,), ``height`` metres above the table, that pixel (x, y) of a photo sees."""
     ray = rig.rays(np.array([x, y]), *size)
     if ray[2] >= 0:
         raise InputError("ball: that place in the photo is not on the table")
-    return rig.camera - ray * (rig.camera[2] / ray[2])
+    return rig.camera - ray * ((rig.camera[2] - height) / ray[2])
 
 
 def _ellipse(points: Array) -> tuple[Array, float, float, float]:

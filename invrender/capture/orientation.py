@@ -17,10 +17,10 @@ from invrender.capture.ball import find_ball
 from invrender.capture.ball_image import unfold_pattern
 from invrender.capture.camera import find_camera
 from invrender.capture.mirror import Ball, place_ball
-from invrender.capture.settings import ORIENTATION, TINY
+from invrender.capture.settings import BALL_SHAPE, ORIENTATION, TINY
 from invrender.files.capture import Capture
 from invrender.files.images import Photo
-from invrender.rig import Rig
+from invrender.rig import BALL_SHAPES, Rig
 from invrender.sampling import resize_pattern
 from invrender.types import Array, InputError, Notice
 
@@ -46,7 +46,7 @@ def find_ball_and_orientation(
         nominal = replace(capture, photo=_turned_photo(photo, first))
         here, tilt_deviation = _posed(nominal)
         try:
-            ball = find_ball(here.photo, here.rig, manual, tilt_deviation)
+            here, ball = _find_ball(here, manual, tilt_deviation)
         except InputError as error:
             problem = problem or error
             continue
@@ -56,15 +56,22 @@ def find_ball_and_orientation(
         )
         if expected > 1 - ORIENTATION.better:  # no orientation can be so much more alike
             return here, ball, _notices(first, 0, False)
+        nominal = replace(
+            nominal, rig=replace(nominal.rig, ball_shape=here.rig.ball_shape)
+        )
         (turn, quarter, mirrored), alike = _best_orientation(nominal, ball)
         if alike > ORIENTATION.alike and alike > expected + ORIENTATION.better:
             turned, moved = _turned(nominal, ball, turn)
             assert moved is not None
-            rig = _turned_rig(capture.rig, ball.size, turn)
+            rig = _turned_rig(
+                replace(capture.rig, ball_shape=here.rig.ball_shape), ball.size, turn
+            )
             shown = oriented(here.pattern, quarter, mirrored)
             here, _ = _posed(replace(nominal, photo=turned, rig=rig, pattern=shown))
             again = place_ball(here.rig, moved.size, *moved.centre, moved.radius)
-            ball = replace(again, confidence=ball.confidence, camera_tilt=moved.camera_tilt)
+            ball = replace(
+                moved, position=again.position, radius_m=again.radius_m, ellipse=again.ellipse
+            )
             return here, ball, _notices((first + turn) % 4, quarter, mirrored)
         if first == 0:
             fallback = here, ball, expected
@@ -86,6 +93,34 @@ def not_the_pattern(ball: Ball) -> InputError:
         "show the pattern: check that the display shows it the right way round, or give the "
         f"ball by hand, --ball {x:.0f},{y:.0f},{r:.0f} to keep this one"
     )
+
+
+def _find_ball(
+    capture: Capture, manual: Circle | None, tilt_deviation: float
+) -> tuple[Capture, Ball]:
+    """The ball, a hemisphere or a sphere, whichever fits better where nobody states it; and the
+    capture with that shape."""
+    photo, rig = capture.photo, capture.rig
+    if "ball_shape" not in capture.unknown or manual is not None:
+        return capture, find_ball(photo, rig, manual, tilt_deviation)
+    found: list[tuple[float, Rig, Ball]] = []
+    problem: InputError | None = None
+    for shape in BALL_SHAPES:
+        shaped = replace(rig, ball_shape=shape)
+        try:
+            ball = find_ball(photo, shaped, None, tilt_deviation)
+        except InputError as error:
+            problem = problem or error
+            continue
+        score = ball.confidence - abs(ball.radius_m / rig.ball_radius - 1)
+        found.append((score, shaped, ball))
+        if score > BALL_SHAPE.certain:
+            break
+    if not found:
+        assert problem is not None
+        raise problem
+    _, shaped, ball = max(found, key=lambda f: f[0])
+    return replace(capture, rig=shaped), ball
 
 
 def _posed(capture: Capture) -> tuple[Capture, float]:
@@ -161,6 +196,15 @@ def _turned(capture: Capture, ball: Ball, turns: int) -> tuple[Photo, Ball | Non
         moved = place_ball(rig, (photo.height, photo.width), x, y, ball.radius)
     except InputError:
         return photo, None
+    moved = replace(
+        ball,
+        position=moved.position,
+        radius_m=moved.radius_m,
+        size=moved.size,
+        centre=moved.centre,
+        radius=moved.radius,
+        ellipse=moved.ellipse,
+    )
     if ball.camera_tilt is None:
         return photo, moved
     tilt = Rotation.from_euler("z", 90 * turns, degrees=True).apply(ball.camera_tilt)

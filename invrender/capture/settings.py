@@ -86,6 +86,17 @@ class MirroredTable:
     tolerance: float = 0.4  # of log radiance, an error that counts wholly; by hand
     wider: tuple[float, ...] = (1.12, 1.2, 1.28)  # of the radius: circles outside; by hand
     wrong: float = 1.3  # of the radius that must fit worse; by hand
+    # Reflectance: distances on the table where it is measured, in radii; and what it may be, of the
+    # channels' mean and of each channel about that, relative; by hand.
+    measured: tuple[float, float] = (1.3, 4.0)
+    reflectances: tuple[float, float] = (0.35, 1.0)
+    tint: float = 0.25
+    independent: float = 20.0  # measurements on the ring that are independent; by hand
+    # Of the logarithm of the measured reflectance: the least deviation. On 16 simulated photos at
+    # the true place the errors were 0.015 (root mean square) where no glare lay over the ball.
+    least_deviation: float = 0.015
+    contradiction: float = 3.0  # deviations from which the rig's reflectance is not believed
+    least_contradiction: float = 0.07  # and of the logarithm; by hand
     # Logistic regression: the features' weights, and the bias. Fitted to simulated photos with and
     # without a ball; the command that did it is not in the repository.
     weights: tuple[float, ...] = (2.63, 2.79, 2.76, -9.88, -0.19, 13.73)
@@ -171,7 +182,8 @@ class SquareFit:
     better: float = 1.8  # sum of four logarithms, from which another square is the one; by hand
     least_side: int = 32  # pixels of a side that tells anything; by hand
     least_move: float = 0.004  # sides; a smaller one is not believed; by hand
-    found_tilt: float = 0.3  # degrees, expected error of the tilt by the square; by hand
+    found_tilt: float = 0.3  # degrees, expected error of the tilt by a moved square; by hand
+    confirmed_tilt: float = 0.5  # degrees, the same where the square is where the rig says; by hand
     unseen_tilt: float = 2.0  # degrees, expected tilt where no square is seen; by hand
     slope_step: float = 0.05  # deviations, of the finite differences; by hand
     outward: tuple[int, int, int] = (-24, 49, 9)  # half pixels: search for the border; by hand
@@ -202,10 +214,19 @@ class Orientation:
 
 
 @dataclass(frozen=True)
+class BallShape:
+    """Hemisphere or full sphere, where nobody states it: `invrender.capture.orientation`."""
+
+    # Confidence of a hemisphere, less its radius's relative error, from which no sphere is tried.
+    certain: float = 0.8  # by hand
+
+
+@dataclass(frozen=True)
 class TableLevel:
     """The table's tilt against the camera: `invrender.capture.lights.level_table`."""
 
     least_tilt: float = 1.1  # degrees; a smaller one is an error of the rim's fit; by hand
+    least_deviations: float = 4.0  # of the rim's fit, likewise; its errors are twice these; by hand
 
 
 @dataclass(frozen=True)
@@ -381,6 +402,7 @@ MIRRORED_TABLE = MirroredTable()
 RIM_FIT = RimFit()
 SQUARE_FIT = SquareFit()
 ORIENTATION = Orientation()
+BALL_SHAPE = BallShape()
 TABLE_LEVEL = TableLevel()
 GLARE_FIT = GlareFit()
 SCREEN_FIT = ScreenFit()

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from invrender.files.write import atomic_path
-from invrender.rig import Rig, Vec3
+from invrender.rig import BALL_SHAPES, Rig, Vec3
 from invrender.types import InputError, Notice
 
 # Section and key of rig.toml for each field of Rig.
@@ -24,6 +24,7 @@ _KEYS: dict[tuple[str, str], str] = {
     ("camera", "tilt"): "camera_tilt",
     ("ball", "radius"): "ball_radius",
     ("ball", "reflectance"): "ball_reflectance",
+    ("ball", "shape"): "ball_shape",
 }
 _FILES = {("pattern", "image"), ("sample", "maps")}
 _REQUIRED = [("screen", "size"), ("screen", "height"), ("camera", "offset"), ("ball", "radius")]
@@ -64,8 +65,13 @@ def read_rig(path: Path, *, fov: float | None = None) -> RigFile:
                     raise InputError(f"{path}: [{section}] {key} must be a file name")
                 files[section] = value
             elif (section, key) in _KEYS:
-                name = _KEYS[section, key]
-                values[name] = _number(path, f"[{section}] {key}", value, name in _VECTORS)
+                name, what = _KEYS[section, key], f"[{section}] {key}"
+                if name == "ball_shape":
+                    if value not in BALL_SHAPES:
+                        raise InputError(f"{path}: {what} must be one of {', '.join(BALL_SHAPES)}")
+                    values[name] = value
+                else:
+                    values[name] = _number(path, what, value, name in _VECTORS)
             else:
                 known = sorted({k for s, k in [*_KEYS, *_FILES] if s == section})
                 hint = f"known keys: {', '.join(known)}" if known else "no such section"
@@ -139,7 +145,10 @@ def write_rig(path: Path, rig: Rig, pattern: str = "", sample: str = "") -> None
     for (section, key), name in _KEYS.items():
         value = getattr(rig, name)
         if (section, key) in _REQUIRED or value != getattr(default, name) or name == "fov":
-            text = str(list(value)) if isinstance(value, tuple) else repr(float(value))
+            if isinstance(value, str):
+                text = f'"{value}"'
+            else:
+                text = str(list(value)) if isinstance(value, tuple) else repr(float(value))
             entries.append((section, key, text))
     entries += [("pattern", "image", f'"{pattern}"')] if pattern else []
     entries += [("sample", "maps", f'"{sample}"')] if sample else []
