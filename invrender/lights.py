@@ -31,7 +31,9 @@ class Lights:
     ``hidden_lamp`` how many times brighter than the filling a part of the room behind the screen
     was made (1: none), ``pattern_residual`` the residual before the screen's pose and curve were
     fitted, ``screen_shift`` (metres) and ``screen_tilt`` (degrees) how far the screen is found from
-    its place, ``camera_tilt`` how far the camera is found to look past straight down, in degrees.
+    its place, ``camera_tilt`` how far the camera is found to look past straight down, in degrees,
+    ``ball_reflectance`` the mirror's and ``ball_reflectance_deviation`` the standard deviation of
+    its logarithm (0: it was stated), with which all radiance here scales.
 
         lights = Lights(Rig(), default_pattern(), gain=2.0)
     """

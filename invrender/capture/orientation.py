@@ -56,16 +56,12 @@ def find_ball_and_orientation(
         )
         if expected > 1 - ORIENTATION.better:  # no orientation can be so much more alike
             return here, ball, _notices(first, 0, False)
-        nominal = replace(
-            nominal, rig=replace(nominal.rig, ball_shape=here.rig.ball_shape)
-        )
+        nominal = replace(nominal, rig=replace(nominal.rig, ball_shape=here.rig.ball_shape))
         (turn, quarter, mirrored), alike = _best_orientation(nominal, ball)
         if alike > ORIENTATION.alike and alike > expected + ORIENTATION.better:
             turned, moved = _turned(nominal, ball, turn)
             assert moved is not None
-            rig = _turned_rig(
-                replace(capture.rig, ball_shape=here.rig.ball_shape), ball.size, turn
-            )
+            rig = _turned_rig(replace(capture.rig, ball_shape=here.rig.ball_shape), ball.size, turn)
             shown = oriented(here.pattern, quarter, mirrored)
             here, _ = _posed(replace(nominal, photo=turned, rig=rig, pattern=shown))
             again = place_ball(here.rig, moved.size, *moved.centre, moved.radius)

@@ -22,7 +22,9 @@ class Capture:
     """One capture. ``pattern`` (h, w, 3) is the ideal one, relative radiance in [0, 1].
 
     ``fov_from`` says where the rig's field of view is known from: "rig" (rig.toml), "exif", or
-    "unknown". ``warnings`` tell what is doubtful about the files. ``truth`` and
+    "unknown". ``unknown``: which of the rig's "ball_reflectance" and "ball_shape" nobody states, so
+    that they are found in the photo. ``warnings`` tell what is doubtful about the files. ``truth``
+    and
     ``true_environment`` come with synthetic captures only: to measure errors against, never an
     input.
     """
@@ -35,6 +37,7 @@ class Capture:
     fov_from: str = "rig"
     warnings: tuple[Notice, ...] = ()
     name: str = "capture"
+    unknown: frozenset[str] = frozenset()
 
 
 def load_capture(folder: str | Path) -> Capture:
@@ -54,7 +57,7 @@ def load_capture(folder: str | Path) -> Capture:
         raise InputError(f"{folder} has more than one photo ({found}); leave one")
     photo = read_photo(photos[0])
     check_photo(photo, str(photos[0]))
-    rig, files, fov_from, warnings = read_rig(folder / "rig.toml", fov=photo.fov)
+    rig, files, fov_from, warnings, unknown = read_rig(folder / "rig.toml", fov=photo.fov)
     pattern_path = _inside(folder, files.get("pattern") or _find_pattern(folder))
     pattern = read_image(pattern_path)
     if pattern.min() < 0 or pattern.max() > 1 + 1e-3:
@@ -69,7 +72,7 @@ def load_capture(folder: str | Path) -> Capture:
             environment = read_image(maps / "environment.exr")
     return Capture(
         photo, rig, np.clip(pattern, 0, 1), truth, environment, fov_from,
-        (*photo.warnings, *warnings), folder.resolve().name,
+        (*photo.warnings, *warnings), folder.resolve().name, unknown,
     )  # fmt: skip
 
 

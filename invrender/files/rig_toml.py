@@ -26,6 +26,7 @@ _KEYS: dict[tuple[str, str], str] = {
     ("ball", "reflectance"): "ball_reflectance",
     ("ball", "shape"): "ball_shape",
 }
+_FOUND_IN_PHOTO = frozenset({"ball_reflectance", "ball_shape"})
 _FILES = {("pattern", "image"), ("sample", "maps")}
 _REQUIRED = [("screen", "size"), ("screen", "height"), ("camera", "offset"), ("ball", "radius")]
 # Metres; the largest displays that are sold are 2.6 m wide.
@@ -38,13 +39,15 @@ class RigFile(NamedTuple):
 
     files: the names of the pattern and of the sample's true maps, where given. fov_from: where the
     field of view is known from, "rig" (this file), "exif" or "unknown" (`Rig`'s default stands in).
-    warnings: what is doubtful about the numbers.
+    warnings: what is doubtful about the numbers. unknown: of "ball_reflectance" and "ball_shape"
+    what the file does not give, so that it is found in the photo.
     """
 
     rig: Rig
     files: dict[str, str]
     fov_from: str = "rig"
     warnings: tuple[Notice, ...] = ()
+    unknown: frozenset[str] = frozenset()
 
 
 def read_rig(path: Path, *, fov: float | None = None) -> RigFile:
@@ -92,7 +95,7 @@ def read_rig(path: Path, *, fov: float | None = None) -> RigFile:
                 "these are millimetres, divide them by 1000",
             ),
         )
-    return RigFile(rig, files, fov_from, warnings)
+    return RigFile(rig, files, fov_from, warnings, _FOUND_IN_PHOTO - values.keys())
 
 
 def _table(path: Path) -> dict[str, Any]:
@@ -137,14 +140,19 @@ def _number(path: Path, what: str, value: Any, vector: bool) -> float | Vec3:
 
 
 def write_rig(path: Path, rig: Rig, pattern: str = "", sample: str = "") -> None:
-    """Write ``rig.toml``; fields at their default are left out, except the four required ones."""
+    """Write ``rig.toml``. Fields at their default are left out where reading takes the default."""
     default = Rig()
     lines: list[str] = []
     section_now = ""
     entries: list[tuple[str, str, str]] = []
     for (section, key), name in _KEYS.items():
         value = getattr(rig, name)
-        if (section, key) in _REQUIRED or value != getattr(default, name) or name == "fov":
+        # What would else be looked for in the photo is always stated.
+        if (
+            (section, key) in _REQUIRED
+            or name in _FOUND_IN_PHOTO or name == "fov"
+            or value != getattr(default, name)
+        ):
             if isinstance(value, str):
                 text = f'"{value}"'
             else:
