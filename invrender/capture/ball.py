@@ -29,7 +29,14 @@ from invrender.capture.mirror import (
     place_ball,
 )
 from invrender.capture.robust import spread
-from invrender.capture.settings import BALL_SEARCH, BALL_VIEW, MIRRORED_TABLE, RIM_FIT, TINY
+from invrender.capture.settings import (
+    BALL_SEARCH,
+    BALL_VIEW,
+    FIELD_OF_VIEW,
+    MIRRORED_TABLE,
+    RIM_FIT,
+    TINY,
+)
 from invrender.files.images import Photo
 from invrender.rig import Rig
 from invrender.types import Array, InputError, Mask, Vec3
@@ -58,34 +65,11 @@ def find_ball(
         ball = place_ball(rig, size, *manual)
         _check_exposure(photo, ball)
         return measure_reflectance(photo, rig, ball)
-    expected = make_ball(rig, rig.ball_centre, rig.ball_radius, size)
-    if expected.radius < BALL_SEARCH.least_radius:
-        raise InputError(
-            f"the ball should be {expected.radius:.1f} pixels in radius by the rig, too small to "
-            "read: take a larger photo or check rig.toml"
-        )
-    middle = np.asarray(expected.centre)
-    if not ((middle >= 0) & (middle <= size[::-1])).all():  # also where it is no number
-        raise InputError("the rig puts the ball outside the photo: check its lengths and its tilt")
-    reach = (BALL_SEARCH.reach + BALL_SEARCH.view_margin) * expected.radius
-    view = view_around(photo, middle, reach, expected.radius / BALL_SEARCH.view_radius)
-
-    def score(circle: Array, blur: int) -> float:
-        return _score(view, _with_reflectance(view, rig, circle, blur)[0], circle, 64, blur)[0]
-
-    def climb(circle: Array, reach: float, blur: int, evaluations: int) -> Array:
-        mirror, _ = _with_reflectance(view, rig, circle, blur)
-        return _climb(view, mirror, circle, reach, blur, evaluations)
-
-    candidates = sorted(_coarse(view, rig, expected), key=lambda c: -score(c, 2))
-    climbed = [climb(c, *BALL_SEARCH.climb_first) for c in candidates[: BALL_SEARCH.candidates]]
-    if not climbed:
-        raise InputError("no mirror ball found: the photo shows nothing where the rig puts it")
-    climbed.sort(key=lambda c: -score(c, 1))
+    view, climbed = _search(photo, rig)
 
     def finer(circle: Array) -> Array:
         for settings in BALL_SEARCH.climbs:
-            circle = climb(circle, *settings)
+            circle = _climb_measured(view, rig, circle, *settings)
         return circle
 
     def circles() -> Iterator[Array]:
@@ -101,9 +85,9 @@ def find_ball(
     balls: list[Ball] = []
     for circle in circles():
         found = _fit(photo, view, rig, circle, bool(balls), tilt_deviation)
-        agrees = any(_distance(found, other) < BALL_SEARCH.same for other in balls)
+        fits_agree = any(_distance(found, other) < BALL_SEARCH.same for other in balls)
         balls.append(found)
-        if found.confidence > (BALL_SEARCH.likely if agrees else BALL_SEARCH.certain):
+        if found.confidence > (BALL_SEARCH.likely if fits_agree else BALL_SEARCH.certain):
             break
     ball = max(balls, key=lambda b: b.confidence)
     if tilt_deviation > RIM_FIT.tilt_deviation:
@@ -118,6 +102,92 @@ def find_ball(
         raise InputError(f"the mirror ball at {x:.0f}, {y:.0f} is cut off by the edge of the photo")
     _check_exposure(photo, ball)
     return measure_reflectance(photo, rig, ball)
+
+
+def find_fov(photo: Photo, rig: Rig, manual: tuple[float, float, float] | None = None) -> float:
+    """The horizontal field of view, degrees, in which the ball is as large as the rig says.
+
+    The ball is looked for with focal lengths a step apart; in the likeliest few its rim is fitted.
+    ``manual`` (x, y, r) in pixels is a ball given by hand. Raises `InputError` where no ball is
+    found with any of them.
+    """
+    if manual is not None:
+        for _ in range(FIELD_OF_VIEW.rounds):
+            ball = place_ball(rig, (photo.height, photo.width), *manual)
+            rig = replace(rig, fov=_fov_by(ball, rig))
+        return rig.fov
+    half = np.tan(np.radians([FIELD_OF_VIEW.narrowest, FIELD_OF_VIEW.widest]) / 2)
+    count = math.ceil(math.log(half[1] / half[0]) / math.log(FIELD_OF_VIEW.step)) + 1
+    scored: list[tuple[float, Rig]] = []
+    for tangent in np.geomspace(*half, count):
+        tried = replace(rig, fov=math.degrees(2 * math.atan(tangent)))
+        try:
+            view, climbed = _search(photo, tried)
+        except InputError:
+            continue
+        scored.append((_score_measured(view, tried, climbed[0], 0), tried))
+    scored.sort(key=lambda pair: -pair[0])
+    best: tuple[float, float] | None = None
+    for _, tried in scored[: FIELD_OF_VIEW.tries]:
+        try:
+            for _ in range(FIELD_OF_VIEW.rounds):
+                ball = find_ball(photo, tried)
+                tried = replace(tried, fov=_fov_by(ball, tried))
+        except InputError:
+            continue
+        if best is None or ball.confidence > best[0]:
+            best = ball.confidence, tried.fov
+    if best is None:
+        raise InputError(
+            "neither rig.toml nor the photo's EXIF gives the field of view, and no mirror ball was "
+            "found to measure it by: set [camera] fov in rig.toml"
+        )
+    return best[1]
+
+
+def _fov_by(ball: Ball, rig: Rig) -> float:
+    """The field of view, degrees, in which that ball in the photo has the rig's radius."""
+    tangent = math.tan(math.radians(rig.fov) / 2) * rig.ball_radius / ball.radius_m
+    return math.degrees(2 * math.atan(tangent))
+
+
+def _score_measured(view: View, rig: Rig, circle: Array, blur: int) -> float:
+    """The score of a circle, with the reflectance that its image shows."""
+    return _score(view, _with_reflectance(view, rig, circle, blur)[0], circle, 64, blur)[0]
+
+
+def _climb_measured(
+    view: View, rig: Rig, circle: Array, reach: float, blur: int, evaluations: int
+) -> Array:
+    """A better circle nearby, with the reflectance that the first one's image shows."""
+    mirror, _ = _with_reflectance(view, rig, circle, blur)
+    return _climb(view, mirror, circle, reach, blur, evaluations)
+
+
+def _search(photo: Photo, rig: Rig) -> tuple[View, list[Array]]:
+    """The view of the search, and circles in it that may be the ball's, the likeliest first."""
+    size = (photo.height, photo.width)
+    expected = make_ball(rig, rig.ball_centre, rig.ball_radius, size)
+    if expected.radius < BALL_SEARCH.least_radius:
+        raise InputError(
+            f"the ball should be {expected.radius:.1f} pixels in radius by the rig, too small to "
+            "read: take a larger photo or check rig.toml"
+        )
+    middle = np.asarray(expected.centre)
+    if not ((middle >= 0) & (middle <= size[::-1])).all():  # also where it is no number
+        raise InputError("the rig puts the ball outside the photo: check its lengths and its tilt")
+    reach = (BALL_SEARCH.reach + BALL_SEARCH.view_margin) * expected.radius
+    view = view_around(photo, middle, reach, expected.radius / BALL_SEARCH.view_radius)
+    candidates = sorted(
+        _coarse(view, rig, expected), key=lambda c: -_score_measured(view, rig, c, 2)
+    )
+    climbed = [
+        _climb_measured(view, rig, c, *BALL_SEARCH.climb_first)
+        for c in candidates[: BALL_SEARCH.candidates]
+    ]
+    if not climbed:
+        raise InputError("no mirror ball found: the photo shows nothing where the rig puts it")
+    return view, sorted(climbed, key=lambda c: -_score_measured(view, rig, c, 1))
 
 
 def measure_reflectance(photo: Photo, rig: Rig, ball: Ball) -> Ball:

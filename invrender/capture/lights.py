@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
-from invrender.capture.ball import agrees
+from invrender.capture.ball import agrees, find_fov
 from invrender.capture.ball_image import BallImage, trace_image, unfold_pattern
 from invrender.capture.camera import find_camera
 from invrender.capture.clipped_lamps import raise_clipped
@@ -66,8 +66,11 @@ def find_lights(
         capture = replace(capture, rig=rig)
         lights = known_lights(capture, environment, gain)
         return FoundLights(capture, lights, None, capture.warnings)
+    fov_notices: tuple[Notice, ...] = ()
     # The matrices are small: more threads than one only slow each other down.
     with threadpool_limits(1, "blas"):
+        if capture.fov_from == "unknown":
+            capture, fov_notices = measure_fov(capture, ball)
         capture, found, turned = find_ball_and_orientation(capture, ball)
         capture, mirror = use_reflectance(capture, found)
         lights = measure_lights(capture, found)
@@ -75,7 +78,9 @@ def find_lights(
         lights = replace(lights, environment=environment)
     if gain is not None:
         lights = replace(lights, gain=_rgb(gain))
-    notices = (*capture.warnings, *turned, *mirror, *light_warnings(lights))
+    notices = (
+        *capture.warnings, *fov_notices, *turned, *mirror, *light_warnings(lights)
+    )  # fmt: skip
     return FoundLights(capture, lights, found, notices)
 
 
@@ -88,6 +93,19 @@ def known_lights(capture: Capture, environment: Array, gain: Any) -> Lights:
 
 def _rgb(gain: Any) -> Array:
     return np.broadcast_to(np.asarray(gain, np.float32), 3).copy()
+
+
+def measure_fov(
+    capture: Capture, ball: tuple[float, float, float] | None = None
+) -> tuple[Capture, tuple[Notice, ...]]:
+    """The capture with the field of view by the ball's size, where nothing else gives it; the ball
+    may be given by hand."""
+    rig = replace(capture.rig, fov=find_fov(capture.photo, capture.rig, ball))
+    text = (
+        f"neither rig.toml nor the photo's EXIF gives the field of view; by the ball's size it is "
+        f"{rig.fov:.1f}° across the photo: set [camera] fov in rig.toml if you know it better"
+    )
+    return replace(capture, rig=rig), (Notice("fov-measured", text),)
 
 
 def use_reflectance(capture: Capture, ball: Ball) -> tuple[Capture, tuple[Notice, ...]]:

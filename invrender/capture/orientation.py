@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 from invrender.capture.ball import find_ball
 from invrender.capture.ball_image import unfold_pattern
 from invrender.capture.camera import find_camera
-from invrender.capture.mirror import Ball, place_ball
-from invrender.capture.settings import BALL_SHAPE, ORIENTATION, TINY
+from invrender.capture.mirror import Ball, make_ball, place_ball
+from invrender.capture.settings import BALL_SHAPE, CROPPING, ORIENTATION, TINY
 from invrender.files.capture import Capture
 from invrender.files.images import Photo
 from invrender.rig import BALL_SHAPES, Rig
@@ -50,6 +50,8 @@ def find_ball_and_orientation(
         except InputError as error:
             problem = problem or error
             continue
+        if manual is None:
+            _check_uncropped(here, ball)
         expected = _correlation(
             unfold_pattern(here.photo, here.rig, ball, ORIENTATION.cells),
             resize_pattern(here.pattern, ORIENTATION.cells),
@@ -79,6 +81,23 @@ def find_ball_and_orientation(
     if manual is None and expected < ORIENTATION.unlike and has_sides:
         raise not_the_pattern(ball)
     return here, ball, ()
+
+
+def _check_uncropped(capture: Capture, ball: Ball) -> None:
+    """Raise `InputError` for a photo whose shape no camera has, with the ball off its middle: the
+    optical axis is then not the photo's centre."""
+    photo = capture.photo
+    ratio = max(photo.width, photo.height) / min(photo.width, photo.height)
+    off = np.abs(np.log(np.array(CROPPING.ratios) / ratio)).min()
+    rig = capture.rig
+    expected = make_ball(rig, rig.ball_centre, rig.ball_radius, ball.size)
+    distance = math.dist(ball.centre, expected.centre) / ball.radius
+    if off > CROPPING.tolerance and distance > CROPPING.off_centre:
+        raise InputError(
+            f"the photo seems to be cropped off centre: it has {photo.width} × {photo.height} "
+            f"pixels, as no camera makes them, and the ball lies {distance:.1f} radii from its "
+            "middle; give the whole photo, or the ball by hand with --ball to take it as it is"
+        )
 
 
 def not_the_pattern(ball: Ball) -> InputError:

@@ -214,6 +214,27 @@ class Orientation:
 
 
 @dataclass(frozen=True)
+class FieldOfView:
+    """The field of view by the ball's size, where neither rig.toml nor EXIF gives it."""
+
+    narrowest: float = 35.0  # degrees across the photo; a 57 mm equivalent lens; by hand
+    widest: float = 95.0  # degrees; a 16 mm equivalent lens; by hand
+    step: float = 1.15  # of the focal length, between two tries; by hand
+    tries: int = 3  # likeliest ones in which the ball is fitted; by hand
+    rounds: int = 2  # of the ball's fit, each with the field of view from the one before; by hand
+
+
+@dataclass(frozen=True)
+class Cropping:
+    """What tells a photo that was cropped: `invrender.capture.orientation`."""
+
+    # Width over height of whole photos, the longer side first; what cameras and phones have.
+    ratios: tuple[float, ...] = (1.0, 5 / 4, 4 / 3, 7 / 5, 3 / 2, 16 / 10, 16 / 9, 2.0)
+    tolerance: float = 0.01  # of the ratio: raw files have some columns more; by hand
+    off_centre: float = 0.5  # radii, of the ball from where the rig puts it; by hand
+
+
+@dataclass(frozen=True)
 class BallShape:
     """Hemisphere or full sphere, where nobody states it: `invrender.capture.orientation`."""
 
@@ -403,6 +424,8 @@ RIM_FIT = RimFit()
 SQUARE_FIT = SquareFit()
 ORIENTATION = Orientation()
 BALL_SHAPE = BallShape()
+FIELD_OF_VIEW = FieldOfView()
+CROPPING = Cropping()
 TABLE_LEVEL = TableLevel()
 GLARE_FIT = GlareFit()
 SCREEN_FIT = ScreenFit()

@@ -43,6 +43,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     from invrender.files.capture import Capture, check_photo, load_capture
     from invrender.files.images import read_photo
     from invrender.files.output import check_output
+    from invrender.files.rig_toml import FOUND_IN_PHOTO
     from invrender.files.write import atomic_path, write_exr
     from invrender.pattern.default import default_pattern
     from invrender.report.inspection import annotate, camera_place, summary
@@ -57,7 +58,14 @@ def run(args: argparse.Namespace, console: Console) -> int:
         check_photo(photo, str(args.capture))
         rig = Rig() if photo.fov is None else Rig(fov=photo.fov)
         fov_from = "unknown" if photo.fov is None else "exif"
-        capture = Capture(photo, rig, default_pattern(), fov_from=fov_from, warnings=photo.warnings)
+        capture = Capture(
+            photo,
+            rig,
+            default_pattern(),
+            fov_from=fov_from,
+            warnings=photo.warnings,
+            unknown=FOUND_IN_PHOTO,
+        )
     nominal = capture.rig
     found = find_lights(capture, ball=args.ball)
     capture, ball, lights = found.capture, found.ball, found.lights

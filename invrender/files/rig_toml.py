@@ -26,7 +26,8 @@ _KEYS: dict[tuple[str, str], str] = {
     ("ball", "reflectance"): "ball_reflectance",
     ("ball", "shape"): "ball_shape",
 }
-_FOUND_IN_PHOTO = frozenset({"ball_reflectance", "ball_shape"})
+# Fields of the rig that are measured in the photo where the file does not state them.
+FOUND_IN_PHOTO = frozenset({"ball_reflectance", "ball_shape"})
 _FILES = {("pattern", "image"), ("sample", "maps")}
 _REQUIRED = [("screen", "size"), ("screen", "height"), ("camera", "offset"), ("ball", "radius")]
 # Metres; the largest displays that are sold are 2.6 m wide.
@@ -95,7 +96,7 @@ def read_rig(path: Path, *, fov: float | None = None) -> RigFile:
                 "these are millimetres, divide them by 1000",
             ),
         )
-    return RigFile(rig, files, fov_from, warnings, _FOUND_IN_PHOTO - values.keys())
+    return RigFile(rig, files, fov_from, warnings, FOUND_IN_PHOTO - values.keys())
 
 
 def _table(path: Path) -> dict[str, Any]:
@@ -150,7 +151,8 @@ def write_rig(path: Path, rig: Rig, pattern: str = "", sample: str = "") -> None
         # What would else be looked for in the photo is always stated.
         if (
             (section, key) in _REQUIRED
-            or name in _FOUND_IN_PHOTO or name == "fov"
+            or name in FOUND_IN_PHOTO
+            or name == "fov"
             or value != getattr(default, name)
         ):
             if isinstance(value, str):
