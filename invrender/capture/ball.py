@@ -116,10 +116,13 @@ def find_fov(photo: Photo, rig: Rig, manual: tuple[float, float, float] | None =
             ball = place_ball(rig, (photo.height, photo.width), *manual)
             rig = replace(rig, fov=_fov_by(ball, rig))
         return rig.fov
-    half = np.tan(np.radians([FIELD_OF_VIEW.narrowest, FIELD_OF_VIEW.widest]) / 2)
-    count = math.ceil(math.log(half[1] / half[0]) / math.log(FIELD_OF_VIEW.step)) + 1
+    low, high = (
+        math.tan(math.radians(angle) / 2)
+        for angle in (FIELD_OF_VIEW.narrowest, FIELD_OF_VIEW.widest)
+    )
+    count = math.ceil(math.log(high / low) / math.log(FIELD_OF_VIEW.step)) + 1
     scored: list[tuple[float, Rig]] = []
-    for tangent in np.geomspace(*half, count):
+    for tangent in np.geomspace(low, high, count):
         tried = replace(rig, fov=math.degrees(2 * math.atan(tangent)))
         try:
             view, climbed = _search(photo, tried)
