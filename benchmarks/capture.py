@@ -16,7 +16,6 @@ import contextlib
 import math
 import statistics
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +25,10 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.common.photos import Shot, arguments, make_shot
 from benchmarks.common.results import bar, table, write_results
-from invrender.capture.ball import find_ball
-from invrender.capture.camera import corners, find_camera
+from invrender.capture.camera import corners
 from invrender.capture.lights import find_lights, measure_lights
 from invrender.capture.mirror import make_ball
+from invrender.capture.orientation import find_ball_and_orientation
 from invrender.capture.table import room_irradiance
 from invrender.files.capture import Capture
 from invrender.rig import Rig
@@ -59,14 +58,12 @@ def measure(shot: Shot, kind: str) -> dict[str, Any]:
     capture = Capture(shot.photo, shot.nominal, shot.pattern)
     start = time.process_time()
     try:
-        rig, tilt = find_camera(capture.photo, capture.rig)
-        capture = replace(capture, rig=rig)
+        capture, ball, _ = find_ball_and_orientation(capture)
         true = corners(shot.photo, shot.rig)
         side = np.linalg.norm(true[1] - true[0])
         for name, rig in (("sample told", shot.nominal), ("sample", capture.rig)):
             off = np.linalg.norm(corners(shot.photo, rig) - true, axis=-1)
             row[name] = float(off.mean() / side)
-        ball = find_ball(capture.photo, capture.rig, tilt_deviation=tilt)
         row["s"] = time.process_time() - start
         row["confidence"] = ball.confidence
         if shot.ball is not None:

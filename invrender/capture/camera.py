@@ -20,7 +20,7 @@ from scipy import ndimage
 
 from invrender.capture.ball_image import sample_image
 from invrender.capture.ball_view import View, view_around
-from invrender.capture.settings import SQUARE_FIT, TINY
+from invrender.capture.settings import RIM_FIT, SQUARE_FIT, TINY
 from invrender.files.images import Photo
 from invrender.rig import Rig
 from invrender.types import Array, InputError
@@ -42,7 +42,7 @@ def find_camera(photo: Photo, rig: Rig) -> tuple[Rig, float]:
     moved = np.linalg.norm(at[1] - at[0], axis=-1).mean()
     if moved > SQUARE_FIT.least_move * np.linalg.norm(at[0][1] - at[0][0]):
         return _posed(rig, pose), SQUARE_FIT.found_tilt
-    return rig, SQUARE_FIT.confirmed_tilt
+    return rig, RIM_FIT.tilt_deviation
 
 
 def _find(photo: Photo, rig: Rig) -> Array | None:

@@ -17,7 +17,7 @@ from invrender.capture.ball import find_ball
 from invrender.capture.ball_image import unfold_pattern
 from invrender.capture.camera import find_camera
 from invrender.capture.mirror import Ball, make_ball, place_ball
-from invrender.capture.settings import BALL_SHAPE, CROPPING, ORIENTATION, TINY
+from invrender.capture.settings import BALL_SHAPE, CROPPING, ORIENTATION, SQUARE_FIT, TINY
 from invrender.files.capture import Capture
 from invrender.files.images import Photo
 from invrender.rig import BALL_SHAPES, Rig
@@ -47,6 +47,8 @@ def find_ball_and_orientation(
         here, tilt_deviation = _posed(nominal)
         try:
             here, ball = _find_ball(here, manual, tilt_deviation)
+            if tilt_deviation < SQUARE_FIT.unseen_tilt:  # the square shows the tilt better
+                ball = replace(ball, camera_tilt=None, tilt_deviation=None)
         except InputError as error:
             problem = problem or error
             continue

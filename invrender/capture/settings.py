@@ -182,8 +182,7 @@ class SquareFit:
     better: float = 1.8  # sum of four logarithms, from which another square is the one; by hand
     least_side: int = 32  # pixels of a side that tells anything; by hand
     least_move: float = 0.004  # sides; a smaller one is not believed; by hand
-    found_tilt: float = 0.3  # degrees, expected error of the tilt by a moved square; by hand
-    confirmed_tilt: float = 0.5  # degrees, the same where the square is where the rig says; by hand
+    found_tilt: float = 0.3  # degrees, expected error of the tilt by the square; by hand
     unseen_tilt: float = 2.0  # degrees, expected tilt where no square is seen; by hand
     slope_step: float = 0.05  # deviations, of the finite differences; by hand
     outward: tuple[int, int, int] = (-24, 49, 9)  # half pixels: search for the border; by hand
