@@ -89,7 +89,11 @@ class Maps:
     """Material maps of one sample, row 0 at +y.
 
     diffuse, specular: (H, W, 3) linear albedo in [0, 1]; specular is the Fresnel reflectance f0.
-    roughness: (H, W) perceptual, alpha = roughness². normal: (H, W, 3) unit vectors.
+    roughness: (H, W) perceptual, alpha = roughness². normal: (H, W, 3) unit vectors. Raises
+    `InputError` where the sizes differ.
+
+        maps = Maps(diffuse, specular, roughness, normal)
+        height, width = maps.shape
     """
 
     diffuse: Array

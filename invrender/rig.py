@@ -30,7 +30,11 @@ class Rig:
 
     ``ball_shape``: a "hemisphere" has its flat side on the table, a "sphere" stands on the table.
     ``screen_shift`` and ``screen_tilt`` (a rotation vector about the screen's centre), and the
-    same for the camera, say how a hand-held rig differs from the nominal one.
+    same for the camera, say how a hand-held rig differs from the nominal one. Raises `InputError`
+    for sizes that no rig has.
+
+        rig = Rig(screen_size=0.197, screen_height=0.16, camera_offset=0.02)
+        print(rig.sample_size)
     """
 
     screen_size: float = 0.18

@@ -64,7 +64,7 @@ def find_lights(
     if environment is not None and gain is not None:
         rig, _ = find_camera(capture.photo, capture.rig)
         capture = replace(capture, rig=rig)
-        lights = known_lights(capture, environment, gain)
+        lights = Lights(rig, capture.pattern, environment, _rgb(gain))
         return FoundLights(capture, lights, None, capture.warnings)
     fov_notices: tuple[Notice, ...] = ()
     # The matrices are small: more threads than one only slow each other down.
@@ -82,13 +82,6 @@ def find_lights(
         *capture.warnings, *fov_notices, *turned, *mirror, *light_warnings(lights)
     )  # fmt: skip
     return FoundLights(capture, lights, found, notices)
-
-
-def known_lights(capture: Capture, environment: Array, gain: Any) -> Lights:
-    """Lights that a person states: the pattern is taken to be shown as it should be."""
-    covered = np.ones(environment.shape[:2], np.float32)
-    shown = (capture.pattern * _rgb(gain)).astype(np.float32)
-    return Lights(capture.rig, capture.pattern, environment, _rgb(gain), covered, shown)
 
 
 def _rgb(gain: Any) -> Array:

@@ -20,7 +20,7 @@ def add_parser(commands: Any) -> None:
     )
     parser.add_argument("-o", "--out", type=Path, required=True, help="new folder to write")
     parser.add_argument("--maps", type=Path, help="folder with a material's maps")
-    parser.add_argument("--kind", help="procedural material instead, e.g. bricks or rust")
+    parser.add_argument("--kind", help="procedural material instead, e.g. bricks or rusty_metal")
     parser.add_argument("--environment", type=Path, help="equirectangular EXR or HDR file")
     parser.add_argument("--pattern", type=Path, help="pattern image (the default one)")
     parser.add_argument("--irradiance", type=float, default=0.5, help="of the room (0.5)")

@@ -17,7 +17,7 @@ from invrender.types import Array, InputError
 
 
 def simulate(
-    folder: Path,
+    folder: str | Path,
     maps: Maps,
     environment: Array,
     pattern: Array,
@@ -29,12 +29,17 @@ def simulate(
     noise: float = 0.0,
     seed: int = 0,
 ) -> None:
-    """Render a capture and write it as a new folder, whole or not at all.
+    """Path-trace a capture of a material and write it as a new folder, whole or not at all.
 
-    maps: the material, any size; environment: (H, 2H, 3); gain: radiance of the pattern's white;
+    maps: the material, any size; environment: (H, 2H, 3) linear RGB radiance; pattern: (P, P, 3)
+    relative radiance; rig: metres and degrees; gain: radiance of the pattern's white;
     width: of the 4:3 photo; noise: of the sensor, relative to a pixel's value at the photo's 99th
     percentile (shot noise). A rig that is shifted or tilted makes the photo, but ``rig.toml`` gives
-    the nominal one, as a person would; the true one goes to ``truth/rig.toml``.
+    the nominal one, as a person would; the true one goes to ``truth/rig.toml``. Raises `InputError`
+    for a folder that is not empty.
+
+        invrender.simulate("new", maps, room, default_pattern(), Rig(), gain=2.0, noise=0.005)
+        capture = invrender.load_capture("new")
     """
     from invrender.render.path_traced import photograph
 

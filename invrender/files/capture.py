@@ -19,7 +19,10 @@ MIN_PHOTO = 64
 
 @dataclass(frozen=True)
 class Capture:
-    """One capture. ``pattern`` (h, w, 3) is the ideal one, relative radiance in [0, 1].
+    """One capture: a photo of the set-up, linear RGB, with its rig and the pattern that was shown.
+
+    ``pattern`` (h, w, 3) is the ideal one, relative radiance in [0, 1], row 0 at +y. ``name`` is
+    that of its folder.
 
     ``fov_from`` says where the rig's field of view is known from: "rig" (rig.toml), "exif", or
     "unknown". ``unknown``: which of the rig's "ball_reflectance" and "ball_shape" nobody states, so
@@ -44,6 +47,9 @@ def load_capture(folder: str | Path) -> Capture:
     """Read a capture folder: ``photo.*``, ``rig.toml``, the pattern, and the truth if there is any.
 
     Raises `InputError`, one sentence, for anything missing, damaged or out of range.
+
+        capture = load_capture("my-capture")
+        print(capture.rig.screen_height, capture.photo.image.shape)
     """
     folder = Path(folder)
     if not folder.is_dir():

@@ -152,3 +152,14 @@ def test_writing_is_whole_or_nothing(tmp_path):
     with pytest.raises(ValueError, match="non-finite"):
         write_exr(path, np.full((2, 2), np.nan))
     assert not list(tmp_path.iterdir())
+
+
+def test_help_names_kinds_that_there_are(capsys):
+    """They are written in the help, which does not load the materials."""
+    from invrender.data.materials import PRESETS
+
+    with pytest.raises(SystemExit):
+        main(["simulate", "--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    named = text.split("instead, e.g. ")[1].split(" --")[0].split(" or ")
+    assert len(named) == 2 and set(named) <= set(PRESETS)
