@@ -18,7 +18,7 @@ from benchmarks.ablations import VARIANTS
 from benchmarks.common.plot import plot_error_over_time
 from benchmarks.common.results import bar, benchmark_parser, table, write_results
 from nets.model import MAPS
-from nets.store import PRESETS, channels_last
+from nets.store import CONFIGS, channels_last
 from nets.training.dataset import write_shard
 from nets.training.draw import Options
 from nets.training.train import baseline, train
@@ -46,7 +46,7 @@ def train_variant(name: str, args: argparse.Namespace) -> list[dict[str, float]]
         "--threads", str(args.threads), "--device", args.device,
     ])  # fmt: skip
     torch.manual_seed(options.seed)
-    train(options, channels_last(variant(PRESETS[args.preset][1])), loss)
+    train(options, channels_last(variant(CONFIGS[args.preset][1])), loss)
     with open(out / "log.csv", newline="") as f:
         return [{k: float(v) for k, v in row.items()} for row in csv.DictReader(f)]
 

@@ -21,17 +21,19 @@ from invrender.types import Array
 from nets.splitsum import area_resize, mask_environment, pack_rig, prefilter_screen, prefilter_sky
 
 ALBEDO = 0.6
-ROUGHNESS = (0.2, 0.6)
+CLUE_RHO = (0.2, 0.6)
 BASIS = ((0.2, 0.0), (0.2, 0.6), (0.6, 0.0), (0.6, 0.6))  # (ρ, k_d)
 WHITE = 3  # of BASIS: nearly Lambertian, 0.6 of a white plane
 SLOPED = (3, 2, 0)  # of BASIS, in the order of the slope clues
 CLUE_SIZE = 48
 BALL_SIZE = 32
 PATTERN_SIZE = 32
-SAMPLES = 64
+CLUE_SAMPLES = 64
 
 
-def plane_clues(scene: Scene, size: int = CLUE_SIZE, samples: int = SAMPLES) -> tuple[Array, Array]:
+def plane_clues(
+    scene: Scene, size: int = CLUE_SIZE, samples: int = CLUE_SAMPLES
+) -> tuple[Array, Array]:
     """Radiance (size, size, 12) of the four materials of `BASIS`, flat, over the sample; and that
     of the `SLOPED` ones' derivatives along the slopes p and q of n ∝ (p, q, 1), (size, size, 18).
     """
@@ -39,14 +41,14 @@ def plane_clues(scene: Scene, size: int = CLUE_SIZE, samples: int = SAMPLES) -> 
     vec3 = vector(scene.scalar, 3)
     view = make_view(scene, size, size)
     up = vec3(*(dr.opaque(scene.scalar, c) for c in (0.0, 0.0, 1.0)))
-    shadings = [renderer.shade(view, dr.opaque(Float, r), up, samples, True) for r in ROUGHNESS]
+    shadings = [renderer.shade(view, dr.opaque(Float, r), up, samples, True) for r in CLUE_RHO]
     # Radiance, then along p and q: the tangents of the plane's own frame are x and y.
     parts = [[(s.irradiance, s.b, s.a), s.tangents[1], s.tangents[2]] for s in shadings]
     dr.eval(parts)  # one launch for all
 
     def image(material: int, row: int) -> Array:
         rho, k_d = BASIS[material]
-        e, b, a = parts[ROUGHNESS.index(rho)][row]
+        e, b, a = parts[CLUE_RHO.index(rho)][row]
         color = e * (k_d / np.pi) + b * (ALBEDO - k_d) + a
         return np.broadcast_to(np.asarray(color).T, (size * size, 3))
 
@@ -88,7 +90,7 @@ def light_inputs(
     environment: Array | None,
     captured: Array | None = None,
     size: int = CLUE_SIZE,
-    samples: int = SAMPLES,
+    samples: int = CLUE_SAMPLES,
 ) -> dict[str, Array]:
     """The network's inputs that describe the light, as float32 arrays without a batch axis.
 
@@ -105,7 +107,7 @@ def light_inputs(
     active, slopes = plane_clues(make_scene(rig, pattern, None, gain), size, samples)
     out = {
         "active_clues": active,
-        "screen": _levels(prefilter_screen(lit, ROUGHNESS, _relative_height(rig))),
+        "screen": _levels(prefilter_screen(lit, CLUE_RHO, _relative_height(rig))),
         "pattern": area_resize(lit if captured is None else captured, PATTERN_SIZE),
         "rig": pack_rig(rig),
     }
@@ -115,10 +117,10 @@ def light_inputs(
         masked = mask_environment(environment, rig)
         out["env_clues"], more = plane_clues(dark, size, samples)
         slopes = slopes + more
-        out["sky"] = _levels(prefilter_sky(masked, (*ROUGHNESS, None)))
+        out["sky"] = _levels(prefilter_sky(masked, (*CLUE_RHO, None)))
         out["ball"] = ball_image(resample_environment(masked, 64))
     else:
-        sky = prefilter_sky(np.zeros((4, 8, 3)), (*ROUGHNESS, None))
+        sky = prefilter_sky(np.zeros((4, 8, 3)), (*CLUE_RHO, None))
         out |= {"env_clues": np.zeros((size, size, 12)), "sky": _levels(sky)}
         out["ball"] = np.zeros((BALL_SIZE, BALL_SIZE, 3))
     out["slope_clues"] = slopes

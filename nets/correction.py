@@ -35,7 +35,7 @@ from nets.model import (
 )
 from nets.slopes import asinh
 
-PHOTO_NOISE = (0.04, 0.01)  # of the photo: relative to the pixel, and to a white plane
+INPUT_NOISE = (0.04, 0.01)  # of the photo: relative to the pixel, and to a white plane
 ALBEDO_CORRELATION = (0.9, 0.95)  # between the colours of k_d's error, and of k_s's
 REACH = (0.1, 0.1, 0.1, 0.2)  # of a step, in the outputs' unit: k_d, k_s, ρ, slopes
 SIGMA_OFFSET = 1.5  # brings half the logarithm of an expected error to about [-1.5, 1.5]
@@ -58,7 +58,7 @@ def gauss_newton(batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
     slope = 2 * normal
     shared = [(diffuse * e, ALBEDO_CORRELATION[0]), (specular * b, ALBEDO_CORRELATION[1])]
     shared += [(rough * r, 1.0), (slope * p, 1.0), (slope * q, 1.0)]
-    noise = (PHOTO_NOISE[0] * photo) ** 2 + PHOTO_NOISE[1] ** 2
+    noise = (INPUT_NOISE[0] * photo) ** 2 + INPUT_NOISE[1] ** 2
     # JΣJᵀ + R, symmetric: each term is ρ·vvᵀ + (1 - ρ)·diag(v²).
     entries = {}
     for i in range(3):

@@ -18,11 +18,11 @@ from nets.model import Config, Network
 
 AnyNetwork = Network | Correction
 
-KINDS: dict[str, type[Network] | type[Correction]] = {
+NETWORKS: dict[str, type[Network] | type[Correction]] = {
     "network": Network,
     "correction": Correction,
 }
-PRESETS: dict[str, tuple[str, Config]] = {
+CONFIGS: dict[str, tuple[str, Config]] = {
     "small": ("network", Config()),
     "tiny": ("network", Config(8, (1, 1), 1, (1, 1))),  # for tests
     "correction": ("correction", Config(16, (1, 1, 2), 2, (1, 1, 1))),
@@ -37,11 +37,11 @@ SWITCHES_0_1 = {
 
 
 def build(name: str) -> AnyNetwork:
-    """A fresh network from `PRESETS`, in the channels-last layout."""
-    if name not in PRESETS:
-        raise InputError(f"no preset {name!r}; there are {', '.join(PRESETS)}")
-    kind, config = PRESETS[name]
-    return channels_last(KINDS[kind](config))
+    """A fresh network from `CONFIGS`, in the channels-last layout."""
+    if name not in CONFIGS:
+        raise InputError(f"no preset {name!r}; there are {', '.join(CONFIGS)}")
+    kind, config = CONFIGS[name]
+    return channels_last(NETWORKS[kind](config))
 
 
 def channels_last(network: Any) -> Any:
@@ -52,7 +52,7 @@ def channels_last(network: Any) -> Any:
 def save_weights(path: Path, network: nn.Module, notes: dict[str, Any], half: bool = False) -> None:
     """Write safetensors with the network's kind, `Config` and ``notes`` in its header."""
     assert isinstance(network.config, Config)
-    kinds = [k for k, kind in KINDS.items() if type(network) is kind]
+    kinds = [k for k, kind in NETWORKS.items() if type(network) is kind]
     metadata = {
         "kind": kinds[0] if kinds else type(network).__name__,
         "config": json.dumps(asdict(network.config)),
@@ -70,9 +70,9 @@ def load_weights(path: Path) -> tuple[AnyNetwork, dict[str, Any]]:
         with safe_open(path, "pt") as f:
             metadata = f.metadata() or {}
         kind, config = _described(metadata)
-        if kind not in KINDS:
+        if kind not in NETWORKS:
             raise InputError(f"{path} holds an ablation's weights ({kind}), for benchmarks alone")
-        network = channels_last(KINDS[kind](config))
+        network = channels_last(NETWORKS[kind](config))
         network.load_state_dict({k: v.float() for k, v in load_file(path).items()})
     except (OSError, KeyError, TypeError, ValueError, RuntimeError) as e:
         if isinstance(e, InputError):

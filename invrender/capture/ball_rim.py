@@ -33,7 +33,7 @@ from invrender.types import Array, Mask
 
 # The unknowns: x, y, radius in metres; the camera's tilt in degrees about x and y; the logarithms
 # of its blur in the view's pixels and of the mirror's reflectance over the rig's.
-_TILT, _BLUR, _MIRROR = slice(3, 5), 5, 6
+_RIM_TILT, _RIM_BLUR, _MIRROR = slice(3, 5), 5, 6
 
 
 @dataclass(frozen=True)
@@ -80,12 +80,12 @@ def fit_rim(
         found = [lines.descend(q, turns, spread, edge) for q in starts]
         _, p, information = min(found, key=lambda f: f[0])
     covariance = lines.units.T @ np.linalg.inv(information) @ lines.units
-    tilt = math.sqrt(float(np.linalg.eigvalsh(covariance[_TILT, _TILT])[-1]))
+    tilt = math.sqrt(float(np.linalg.eigvalsh(covariance[_RIM_TILT, _RIM_TILT])[-1]))
     return Rim(p[:3], _tilted(rig, p), math.sqrt(covariance[2, 2]) / float(p[2]), tilt)
 
 
 def _tilted(rig: Rig, p: Array) -> Rig:
-    return _turned(rig, *p[_TILT])
+    return _turned(rig, *p[_RIM_TILT])
 
 
 @lru_cache(maxsize=64)
@@ -228,7 +228,7 @@ class _Lines:
 
     def kernel(self, p: Array) -> Array:
         """Weights (samples, points) of the camera's blur along a line."""
-        sigma = math.hypot(math.exp(p[_BLUR]), self.blur)
+        sigma = math.hypot(math.exp(p[_RIM_BLUR]), self.blur)
         weight = np.exp(-0.5 * ((self.samples[:, None] - self.points) / sigma) ** 2)
         return _single(weight / weight.sum(1, keepdims=True))
 
@@ -351,7 +351,7 @@ class _Lines:
         lines, horizon = np.zeros((len(p), *base.shape)), np.zeros((len(p), len(curve)))
         for k, unit in enumerate(self.units):
             trace = fit.trace
-            if k < _BLUR:  # blur and reflectance move no ray
+            if k < _RIM_BLUR:  # blur and reflectance move no ray
                 trace = self.trace(p + unit)
                 moved = horizon_curve(self.view, _tilted(self.rig, p + unit), p + unit, len(curve))
                 horizon[k] = np.sum((moved - curve) * normal, -1)

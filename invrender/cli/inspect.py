@@ -12,7 +12,7 @@ from invrender.cli import arguments
 if TYPE_CHECKING:
     from rich.console import Console
 
-MEGABYTES = 10  # of the picture and the lights
+PICTURE_MEGABYTES = 10  # of the picture and the lights
 
 
 def add_parser(commands: Any) -> None:
@@ -50,7 +50,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     from invrender.rig import Rig
 
     if args.out is not None:
-        check_output(args.out, [args.capture], megabytes=MEGABYTES)
+        check_output(args.out, [args.capture], megabytes=PICTURE_MEGABYTES)
     if args.capture.is_dir():
         capture = load_capture(args.capture)
     else:

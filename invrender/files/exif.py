@@ -11,7 +11,7 @@ from PIL import Image
 from invrender.colour import PRIMARIES
 from invrender.files.raster import SRGB, Encoding, Raster, encoding, gamma
 
-ORIENTATION, EXIF_IFD, INTEROP_IFD = 0x0112, 0x8769, 0xA005
+ORIENTATION_TAG, EXIF_IFD, INTEROP_IFD = 0x0112, 0x8769, 0xA005
 _EXPOSURE_TIME, _F_NUMBER, _ISO, _FOCAL_35MM = 0x829A, 0x829D, 0x8827, 0xA405
 _COLOUR_SPACE, _WIDTH, _HEIGHT, _INTEROP_INDEX = 0xA001, 0xA002, 0xA003, 0x0001
 # DCF 2.0: EXIF's "R03", and the 2 that some cameras write as the colour space.
@@ -34,7 +34,7 @@ def pillow_tags(exif: Image.Exif) -> dict[int, Any]:
     The latter's index is filed under the folder's own number.
     """
     try:
-        found = {ORIENTATION: exif.get(ORIENTATION), **exif.get_ifd(EXIF_IFD)}
+        found = {ORIENTATION_TAG: exif.get(ORIENTATION_TAG), **exif.get_ifd(EXIF_IFD)}
         found[INTEROP_IFD] = exif.get_ifd(INTEROP_IFD).get(_INTEROP_INDEX)
     except Exception:
         return {}
@@ -43,7 +43,7 @@ def pillow_tags(exif: Image.Exif) -> dict[int, Any]:
 
 def orientation(tags: dict[int, Any]) -> int:
     """EXIF's orientation, 1 where it is silent or not a number from 1 to 8."""
-    value = tags.get(ORIENTATION)
+    value = tags.get(ORIENTATION_TAG)
     return int(value) if isinstance(value, (int, np.integer)) and 1 <= value <= 8 else 1
 
 

@@ -14,7 +14,7 @@ from invrender.files.raster import LINEAR, Raster, check_size
 from invrender.files.tiff import tiff_exif
 from invrender.types import InputError
 
-SATURATED = 0.99  # of the sensor's range
+SENSOR_SATURATED = 0.99  # of the sensor's range
 HALF_SIZE = 52_000_000  # pixels from which each 2 × 2 sites make one pixel, without interpolation
 _OPCODE_LISTS = {1: 51008, 2: 51009, 3: 51022}
 _SENSOR = (32803, 34892)  # photometric: a mosaic, and a linear image of the sensor
@@ -49,7 +49,7 @@ def read_raw(path: Path) -> Raster:
             plane = raw.raw_image_visible
             full: NDArray[np.bool_] | None = None
             if white and plane is not None:
-                full = np.asarray(plane >= SATURATED * white)
+                full = np.asarray(plane >= SENSOR_SATURATED * white)
                 full = np.asarray(full[..., :3].any(-1)) if full.ndim == 3 else full
             if not any(raw.camera_whitebalance[:3]):
                 raster.warn(

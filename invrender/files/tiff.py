@@ -12,7 +12,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from invrender.colour import adaptation, white_xyz, xyz_to_rec709
-from invrender.files.exif import EXIF_IFD, ORIENTATION, exif_encoding
+from invrender.files.exif import EXIF_IFD, ORIENTATION_TAG, exif_encoding
 from invrender.files.icc import icc_encoding
 from invrender.files.raster import (
     LINEAR,
@@ -120,7 +120,7 @@ def _read_page(path: Path, page: tifffile.TiffPage, tags: dict[int, Any]) -> Ras
     elif name == "YCBCR" and page.compression not in (6, 7):
         raster.data = _rgb_of_ycbcr(path, page, data)
     raster.encoding = _encoding(path, page, raster, name)
-    orientation = _value(page, ORIENTATION)
+    orientation = _value(page, ORIENTATION_TAG)
     raster.orientation = orientation if orientation in range(1, 9) else 1
     raster.aspect = aspect(*(_number(_value(page, t)) for t in (_X_RESOLUTION, _Y_RESOLUTION)))
     return raster

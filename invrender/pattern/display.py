@@ -19,7 +19,7 @@ from invrender.sampling import resize_pattern
 from invrender.types import Array, InputError
 
 PAGE_PIXELS = 768  # a side of the page's image: the pattern has no finer detail
-LARGEST = 8192  # pixels a side
+LARGEST_PNG = 8192  # pixels a side
 
 
 def device_pixels(size: float, ppi: float) -> int:
@@ -27,10 +27,10 @@ def device_pixels(size: float, ppi: float) -> int:
     if not 30 <= ppi <= 2000:
         raise InputError(f"a display has 30 to 2000 pixels an inch, not {ppi:g}")
     pixels = round(size / INCH * ppi)
-    if not 1 <= pixels <= LARGEST:
+    if not 1 <= pixels <= LARGEST_PNG:
         raise InputError(
             f"a pattern of {1000 * size:g} mm at {ppi:g} pixels an inch would be {pixels} pixels "
-            f"wide; 1 to {LARGEST} are possible"
+            f"wide; 1 to {LARGEST_PNG} are possible"
         )
     return pixels
 

@@ -9,7 +9,7 @@ from invrender.refine.flat import USUAL_ROUGHNESS, plane_terms
 from invrender.render.renderer import Renderer
 from invrender.types import Array
 
-BLOCKS = 16  # a side, whose means the coarse error compares
+BLOCKS = 16  # parts a side, whose means the coarse error and chi² compare
 
 
 def photo_error(picture: Array, photo: Array, clipped: NDArray[np.bool_]) -> float:
@@ -35,7 +35,7 @@ def coarse_error(picture: Array, photo: Array, clipped: NDArray[np.bool_]) -> fl
 
 
 SIDE = 128  # pixels a side that the light in an albedo is looked for by
-DARK = 0.05  # mean albedo below which it is not
+DARK_ALBEDO = 0.05  # mean albedo below which it is not
 PLAIN = 0.005  # deviation of the light's log ratio that is no sign
 SLIGHT = 0.05  # share of the light's log ratio that is no sign
 
@@ -48,7 +48,7 @@ def baked_light(diffuse: Array, renderer: Renderer, samples: int = 64) -> float:
     assumed irradiance rises. The greater of both correlations, by at most `SIDE`² pixels; nought
     for a sample too dark or a light too plain to tell.
     """
-    if float(diffuse.mean()) < DARK:
+    if float(diffuse.mean()) < DARK_ALBEDO:
         return 0.0
     h, w = (min(SIDE, n) for n in diffuse.shape[:2])
     rows, columns = (

@@ -41,8 +41,6 @@ from invrender.refine.theta import D, N, S, project, to_maps
 from invrender.sampling import resize
 from invrender.types import Array
 
-BLOCKS = 16  # parts a side, whose mean residuals the coarse chi² compares, as `checks.coarse_error`
-
 
 @dataclass(frozen=True)
 class Settings:

@@ -8,7 +8,7 @@ from invrender.maps import Maps
 from invrender.types import Array
 
 D, S, R, N = slice(0, 3), slice(3, 6), 6, slice(7, 9)  # places of the parameters in θ
-MIN_ROUGHNESS = 0.03
+MIN_FITTED_ROUGHNESS = 0.03
 MAX_SLOPE = 3.0  # 72 degrees
 
 
@@ -43,7 +43,7 @@ def project(theta: Array) -> Array:
 
 def _in_range(theta: Array) -> Array:
     theta[..., :6] = np.clip(theta[..., :6], 0, 1)
-    theta[..., R] = np.clip(theta[..., R], MIN_ROUGHNESS, 1)
+    theta[..., R] = np.clip(theta[..., R], MIN_FITTED_ROUGHNESS, 1)
     slope = np.linalg.norm(theta[..., N], axis=-1, keepdims=True)
     theta[..., N] *= np.minimum(1, MAX_SLOPE / np.maximum(slope, 1e-9))
     return theta

@@ -60,7 +60,7 @@ _PLACES = {
     ),
     "win": ("Program Files/LLVM/bin", "Program Files/LLVM*/bin"),
 }  # fmt: skip
-_FILES = {
+_LLVM_FILES = {
     "linux": ("libLLVM-*.so*", "libLLVM.so*"), "darwin": ("libLLVM*.dylib",), "win": ("LLVM-C.dll",)
 }  # fmt: skip
 
@@ -91,7 +91,7 @@ def find_llvm(
     folders += [prefix / "lib", prefix / "Library" / "bin", *search]
     found = []
     for folder in folders:
-        for pattern in _FILES[system]:
+        for pattern in _LLVM_FILES[system]:
             with contextlib.suppress(OSError):
                 found += [(_version(path), path) for path in folder.glob(pattern)]
     usable = [(version, path) for version, path in found if version is None or version >= MIN_LLVM]

@@ -12,7 +12,7 @@ from nets.model import MAPS
 
 # Spread of each map over the training data: the error of a constant guess. Errors are measured in
 # it, so that normals (small) and roughness (smooth) weigh as much as albedos from the start.
-SPREAD = {"normal": 0.065, "diffuse": 0.19, "roughness": 0.26, "specular": 0.17}
+SPREADS = {"normal": 0.065, "diffuse": 0.19, "roughness": 0.26, "specular": 0.17}
 NORMAL0_WEIGHT = 0.5
 SIGMA_WEIGHT = 0.1
 
@@ -50,14 +50,14 @@ def compare(out: Batch, batch: Batch) -> dict[str, tuple[Tensor, Tensor]]:
 def total_loss(out: Batch, batch: Batch) -> tuple[Tensor, Batch]:
     """The loss, and it and its parts as numbers without gradients.
 
-    Per map: mean |error| and mean squared error in units of `SPREAD`; L1 on the initial normals;
+    Per map: mean |error| and mean squared error in units of `SPREADS`; L1 on the initial normals;
     the Gaussian negative log-likelihood of sigma given the error, which does not move the maps.
     """
     a, b = predicted(out), truth(batch)
     parts: dict[str, Tensor] = {}
     sigma_loss = torch.zeros((), device=out["sigma"].device)
     for i, k in enumerate(MAPS):
-        error = (a[k] - b[k]) / SPREAD[k]
+        error = (a[k] - b[k]) / SPREADS[k]
         parts[k] = 0.5 * error.abs().mean() + 0.5 * (error**2).clamp(max=16).mean()
         sigma = out["sigma"][:, i : i + 1]
         square = ((a[k] - b[k]).detach() / sigma) ** 2
@@ -65,7 +65,7 @@ def total_loss(out: Batch, batch: Batch) -> tuple[Tensor, Batch]:
         robust = torch.where(square < 9, square, 6 * torch.sqrt(square.clamp(min=9)) - 9)
         sigma_loss = sigma_loss + (0.5 * robust + torch.log(sigma)).mean() + math.log(50)
     if "normal0" in out:
-        error = (out["normal0"] / 2 + 0.5 - b["normal"]) / SPREAD["normal"]
+        error = (out["normal0"] / 2 + 0.5 - b["normal"]) / SPREADS["normal"]
         parts["normal0"] = NORMAL0_WEIGHT * error.abs().mean()
     parts["sigma"] = SIGMA_WEIGHT * sigma_loss
     total = torch.stack(list(parts.values())).sum()

@@ -33,9 +33,9 @@ from torch.optim.swa_utils import AveragedModel
 from nets.batch import Batch
 from nets.correction import Correction
 from nets.model import MAPS, Network
-from nets.store import PRESETS, AnyNetwork, build, load_weights, save_weights
+from nets.store import CONFIGS, AnyNetwork, build, load_weights, save_weights
 from nets.training.loader import batches, read_batch, shards
-from nets.training.loss import SPREAD, compare, total_loss
+from nets.training.loss import SPREADS, compare, total_loss
 
 Tensors = tuple[Tensor, ...] | list[Tensor]
 Loss = Callable[[Batch, Batch], tuple[Tensor, Batch]]
@@ -320,8 +320,8 @@ def plot_log(path: Path, out: Path) -> None:
     for ax, key in zip(axes, (*MAPS, "average"), strict=True):
         for name in names:
             ax.plot(hours, [float(r[f"{name}_{key}"]) for r in rows], ".-", label=name)
-        if key in SPREAD:
-            ax.axhline(SPREAD[key], color="0.7", lw=0.8)
+        if key in SPREADS:
+            ax.axhline(SPREADS[key], color="0.7", lw=0.8)
         ax.set(title=key, xlabel="hours of training", ylabel="RMSE", yscale="log")
     if names:
         axes[0].legend()
@@ -337,7 +337,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--out", type=Path, required=True)
     p.add_argument("--valid", nargs="*", default=[], metavar="NAME=DIR")
     p.add_argument("--valid-count", type=int, default=256, help="captures of each")
-    p.add_argument("--preset", default="small", choices=tuple(PRESETS))
+    p.add_argument("--preset", default="small", choices=tuple(CONFIGS))
     p.add_argument("--weights", type=Path, help="start from these, which may lack the last inputs")
     p.add_argument("--steps", type=int, default=50000)
     p.add_argument("--batch", type=int, default=8)

@@ -4,14 +4,14 @@ torch = pytest.importorskip("torch")
 
 from benchmarks.ablations import VARIANTS, Paper, WithoutLobes  # noqa: E402
 from invrender.types import InputError  # noqa: E402
-from nets.store import PRESETS, build, load_weights, save_weights  # noqa: E402
+from nets.store import CONFIGS, build, load_weights, save_weights  # noqa: E402
 from nets.training.dataset import write_shard  # noqa: E402
 from nets.training.draw import Options  # noqa: E402
 from nets.training.loader import read_batch  # noqa: E402
 from nets.training.train import take_up  # noqa: E402
 
 torch.set_num_threads(1)
-TINY = PRESETS["tiny"][1]
+TINY = CONFIGS["tiny"][1]
 
 
 @pytest.fixture(scope="module")

@@ -20,8 +20,8 @@ from invrender.sampling import resize  # noqa: E402
 from nets.batch import positions  # noqa: E402
 from nets.correction import (  # noqa: E402
     ALBEDO_CORRELATION,
+    INPUT_NOISE,
     INPUTS,
-    PHOTO_NOISE,
     Correction,
     features,
     gauss_newton,
@@ -78,7 +78,7 @@ def test_gauss_newton_is_the_formula():
     j = b["jacobian"][1, :, 2, 3].numpy().reshape(5, 3)
     jacobian = np.concatenate([np.diag(j[0]), np.diag(j[1]), j[2:].T], 1)
     photo = b["photo"][1, :, 2, 3].numpy()
-    noise = np.diag((PHOTO_NOISE[0] * photo) ** 2 + PHOTO_NOISE[1] ** 2)
+    noise = np.diag((INPUT_NOISE[0] * photo) ** 2 + INPUT_NOISE[1] ** 2)
     spread = jacobian @ sigma @ correlation @ sigma @ jacobian.T + noise
     r = photo - b["image"][1, :, 2, 3].numpy()
     white = np.linalg.solve(spread, r)

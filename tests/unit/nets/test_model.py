@@ -229,7 +229,7 @@ def test_split_sum_resembles_the_exact_light():
     """On a plane without a screen, and of the screen alone."""
     env = scale_environment(procedural_environment(11, 64, kind="sky"), 0.5)
     lit = clues.light_inputs(RIG, block_pattern(64), 1.0, None)
-    stack = splitsum.prefilter_sky(env, (*clues.ROUGHNESS, None))
+    stack = splitsum.prefilter_sky(env, (*clues.CLUE_RHO, None))
     lit["sky"] = np.concatenate(list(stack), -1).transpose(2, 0, 1)
     exact = clues.plane_clues(make_scene(RIG, None, env), 12, 64)[0].transpose(2, 0, 1)
     b = make_batch(lit, 12, 12)

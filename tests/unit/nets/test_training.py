@@ -24,7 +24,7 @@ from nets.training import dataset as data  # noqa: E402
 from nets.training import draw, gpu, sheet, train  # noqa: E402
 from nets.training.calibrate import calibrate  # noqa: E402
 from nets.training.loader import batches, read_batch, shards  # noqa: E402
-from nets.training.loss import SPREAD, compare, total_loss, truth  # noqa: E402
+from nets.training.loss import SPREADS, compare, total_loss, truth  # noqa: E402
 from nets.training.sheet import problems  # noqa: E402
 
 OPTIONS = data.Options(size=16, samples=8, seed=3)
@@ -347,7 +347,7 @@ def test_loss_is_least_at_the_truth(folder):
     _, best = total_loss(out, batch)
     assert all(best[k] == pytest.approx(0, abs=1e-5) for k in (*MAPS, "normal0"))
     assert all(float(s.max()) < 1e-9 for s, _ in compare(out, batch).values())
-    out["roughness"] = out["roughness"] + SPREAD["roughness"]
+    out["roughness"] = out["roughness"] + SPREADS["roughness"]
     _, worse = total_loss(out, batch)
     assert worse["roughness"] == pytest.approx(1, rel=0.01)
     assert worse["sigma"] > best["sigma"]

@@ -18,7 +18,7 @@ from invrender.refine.lobes import fit_lobes, read_lobes
 from invrender.refine.posterior import explain
 from invrender.refine.priors import Prior, lobe_prior, network_prior, pooled
 from invrender.refine.several import find_turn
-from invrender.refine.theta import MIN_ROUGHNESS, to_maps, to_theta
+from invrender.refine.theta import MIN_FITTED_ROUGHNESS, to_maps, to_theta
 from invrender.render.fast.estimator import Fast
 from invrender.render.scene import make_scene
 from invrender.report.notices import BAKED
@@ -178,7 +178,7 @@ def test_any_photo_gives_finite_maps_in_range(renderer, value):
     for image in result.maps.encoded().values():
         assert np.isfinite(image).all() and image.min() >= 0 and image.max() <= 1
     assert (result.maps.diffuse + result.maps.specular).max() <= 1 + 1e-6
-    assert result.maps.roughness.min() >= MIN_ROUGHNESS
+    assert result.maps.roughness.min() >= MIN_FITTED_ROUGHNESS
     assert np.isfinite(result.sigma).all()
 
 
