@@ -46,7 +46,7 @@ def measure_values(case: Case, quick: bool) -> dict[str, Any]:
     try:
         import torch
 
-        from benchmarks.common.torch_forward import TorchScene
+        from benchmarks.baselines.torch_forward import TorchScene
 
         torch.set_num_threads(dr.thread_count())
         scene = TorchScene(RIG, case.maps, case.pattern, case.environment, GAIN)

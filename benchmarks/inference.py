@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.ablations import Paper
+from benchmarks.baselines.ablations import Paper
 from benchmarks.common.plot import plot_error_over_time
 from benchmarks.common.results import bar, benchmark_parser, table, write_results
 from benchmarks.common.timing import timed

@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.ablations import VARIANTS
+from benchmarks.baselines.ablations import VARIANTS
 from benchmarks.common.plot import plot_error_over_time
 from benchmarks.common.results import bar, benchmark_parser, table, write_results
 from nets.model import MAPS

@@ -25,11 +25,11 @@ import numpy as np
 import torch
 from scipy.optimize import minimize
 
+from benchmarks.baselines.torch_forward import TorchScene
 from benchmarks.common.captures import PHOTOGRAPHS, arguments, make_captures
 from benchmarks.common.gradients import sample_sensor
 from benchmarks.common.plot import plot_error_over_time
 from benchmarks.common.results import Table, bar, table, write_results
-from benchmarks.common.torch_forward import TorchScene
 from invrender.capture.lights import find_lights
 from invrender.files.capture import load_capture
 from invrender.lights import Lights

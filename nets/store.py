@@ -29,7 +29,7 @@ CONFIGS: dict[str, tuple[str, Config]] = {
 }
 
 # In headers of version 0.1: what was built in besides `Config`'s sizes. Other values were ablations
-# (now `benchmarks.ablations`). "correction" was the kind.
+# (now `benchmarks.baselines.ablations`). "correction" was the kind.
 SWITCHES_0_1 = {
     "clues": "full", "active": True, "slopes": True, "lobes": True, "clue_skips": True,
     "narrow_fusion": True, "denoiser": False,

@@ -2,7 +2,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from benchmarks.ablations import VARIANTS, Paper, WithoutLobes  # noqa: E402
+from benchmarks.baselines.ablations import VARIANTS, Paper, WithoutLobes  # noqa: E402
 from invrender.types import InputError  # noqa: E402
 from nets.store import CONFIGS, build, load_weights, save_weights  # noqa: E402
 from nets.training.dataset import write_shard  # noqa: E402

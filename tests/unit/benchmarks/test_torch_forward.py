@@ -3,8 +3,8 @@
 import numpy as np
 import torch
 
+from benchmarks.baselines.torch_forward import TorchScene
 from benchmarks.common.scenes import GAIN, RIG, make_environment, make_maps
-from benchmarks.common.torch_forward import TorchScene
 from invrender.render import Mis
 from invrender.render.scene import make_scene
 

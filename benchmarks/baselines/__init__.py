@@ -1,0 +1,1 @@
+"""Other methods and lesser networks, small and readable, that ours is measured against."""
