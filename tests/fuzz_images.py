@@ -26,7 +26,7 @@ import numpy as np
 import tifffile
 from PIL import Image
 
-from invrender.files.images import read_photo
+from invrender.files.images import read_image, read_photo
 from invrender.files.write import write_exr
 from invrender.types import InputError
 
@@ -185,6 +185,11 @@ def main() -> int:
     by_format: Counter[str] = Counter()
     whole = seeds(folder)
     names = sorted(whole)
+    for name in names:  # all are read, and what they need is imported before the clock starts
+        path = folder / name
+        path.write_bytes(whole[name])
+        read_image(path)
+        path.unlink()
     sink = io.StringIO()
     done = 0
     while done < count:

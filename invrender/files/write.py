@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import shutil
 import struct
 import tempfile
 from collections.abc import Iterator
@@ -83,7 +85,9 @@ def write_exr(
         try:
             f.write(str(temporary))
         except RuntimeError as error:  # what the binding makes of a full disk
-            raise OSError(str(error)) from None
+            full = shutil.disk_usage(temporary.parent).free < pixels.nbytes
+            reason = errno.ENOSPC if full else errno.EIO
+            raise OSError(reason, os.strerror(reason)) from error
 
 
 def png_tags(colour: bool) -> PngInfo:
