@@ -179,6 +179,7 @@ def _reconstruct(
         history=refined.history,
         capture_fit=_capture_fit(found[0]),
         warnings=[*found[0].notices, *notices],
+        notes=list(found[0].capture.photo.notes),
         map_error=errors,
         versions={n: version(n) for n in ("invrender", "drjit", "mitsuba", "numpy")},
     )

@@ -61,6 +61,7 @@ def summary(found: FoundLights) -> dict[str, Any]:
         "pattern_share": pattern_share(lights),
         "exposure": capture.photo.exposure,
         "warnings": [notice._asdict() for notice in warnings],
+        "notes": [notice._asdict() for notice in found.capture.photo.notes],
     }
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,8 @@ class Report:
     sample_size: metres. seconds: by stage. photo_error: RMS difference of the re-rendered maps from
     the photo over its mean, "initial" and "refined". capture_fit: the screen's ``gain`` (RGB) and
     the numbers of `invrender.Lights.fit`, the ball's place. map_error: RMSE against the truth,
-    "initial" and "refined", where the capture has one.
+    "initial" and "refined", where the capture has one. notes: what was done to the photo's values
+    as they were read.
     """
 
     status: str
@@ -36,11 +37,12 @@ class Report:
     warnings: list[Notice]
     map_error: dict[str, dict[str, float]] | None
     versions: dict[str, str]
+    notes: list[Notice] = field(default_factory=list)
 
     def to_dict(self) -> dict[str, Any]:
         """As ``report.json`` has it."""
-        warnings = [notice._asdict() for notice in self.warnings]
-        return {"schema": SCHEMA, **asdict(self), "warnings": warnings}
+        warnings, notes = ([n._asdict() for n in told] for told in (self.warnings, self.notes))
+        return {"schema": SCHEMA, **asdict(self), "warnings": warnings, "notes": notes}
 
     @classmethod
     def read(cls, folder: Path) -> Report:
@@ -51,7 +53,8 @@ class Report:
             if content.pop("schema", 1) != SCHEMA:
                 raise InputError(f"{path} is of another version of invrender; refine again")
             warnings = [Notice(**w) for w in content.pop("warnings")]
-            return cls(**content, warnings=warnings)
+            notes = [Notice(**n) for n in content.pop("notes", [])]
+            return cls(**content, warnings=warnings, notes=notes)
         except OSError:
             raise InputError(f"{folder} has no report.json: it is no whole result") from None
         except (ValueError, TypeError, KeyError, AttributeError) as error:
