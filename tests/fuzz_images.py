@@ -30,6 +30,7 @@ from invrender.files.images import read_image, read_photo
 from invrender.files.write import write_exr
 from invrender.types import InputError
 
+P3_WHITE_FIRST = (31270, 32900, 68000, 32000, 26500, 69000, 15000, 6000)
 SECONDS, MEMORY = 10.0, 4 * 2**30
 EXTREMES = (0, 1, 2, 3, 7, 0x7F, 0x80, 0xFF, 0x7FFF, 0x8000, 0xFFFF, 0x10000, 0x7FFFFFFF,
             0x80000000, 0xFFFFFFFE, 0xFFFFFFFF)  # fmt: skip
@@ -64,7 +65,7 @@ def seeds(folder: Path) -> dict[str, bytes]:
     )
     keep("pq.png")
     made.write_png(path, np.dstack([code8, code8[..., :1]]), (b"gAMA", struct.pack(">I", 45455)),
-                   (b"cHRM", struct.pack(">8I", *range(30000, 38000, 1000))))  # fmt: skip
+                   (b"cHRM", struct.pack(">8I", *P3_WHITE_FIRST)))  # fmt: skip
     keep("alpha.png")
     for name, data, options in (
         ("lzw.tif", code8, {"compression": "lzw", "predictor": 2}),

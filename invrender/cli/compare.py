@@ -39,6 +39,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
     notes: list[str] = []
     if args.a.is_dir():
         (maps, rig_a), (truth, rig_b) = (_maps(path) for path in (args.a, args.b))
+        maps, truth, note = _same_size(maps, truth)
+        notes += [note] if note else []
         table = map_metrics(maps, truth, rig_b or rig_a)
     else:
         table = {"image": _images(args.a, args.b)}
@@ -72,11 +74,23 @@ def _maps(folder: Path) -> tuple[Any, Any]:
     return capture.truth, capture.rig
 
 
+def _same_size(a: Any, b: Any) -> tuple[Any, Any, str]:
+    """Two sets of maps of one shape at the smaller one's size, and what was done to get there."""
+    from invrender.maps import resize_maps
+
+    (height_a, width_a), (height_b, width_b) = a.shape, b.shape
+    if a.shape == b.shape or height_a * width_b != height_b * width_a:
+        return a, b, ""
+    height, width = min(a.shape, b.shape)
+    note = f"the larger maps were averaged down to {width} × {height} pixels"
+    return resize_maps(a, height, width), resize_maps(b, height, width), note
+
+
 def _images(a: Path, b: Path) -> dict[str, float | None]:
-    """Metrics of two files: linear radiance if either is an EXR, else as displayed."""
+    """Metrics of two files: linear radiance if either is an EXR or HDR, else as displayed."""
     from invrender.files.images import read_image
     from invrender.metrics import image_metrics
 
-    hdr = any(path.suffix.lower() == ".exr" for path in (a, b))
+    hdr = any(path.suffix.lower() in (".exr", ".hdr", ".pic") for path in (a, b))
     # Display values are compared as they are stored.
     return image_metrics(*(read_image(p, linear=not hdr) for p in (a, b)), hdr=hdr)
