@@ -78,7 +78,7 @@ def simulate(
         write_exr(new / "pattern.exr", pattern, half=True)
         write_rig(new / "rig.toml", nominal, "pattern.exr", "truth/")
         write_rig(new / "truth" / "rig.toml", rig)
-        write_maps(new / "truth", maps, half=True)
+        write_maps(new / "truth", maps, half=True, width=rig.sample_size)
         write_exr(new / "truth" / "environment.exr", environment, half=True)
         if folder.exists():
             folder.rmdir()

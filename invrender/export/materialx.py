@@ -8,6 +8,7 @@ holds the dielectric part's f0 per pixel.
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -81,12 +82,13 @@ def _own_elements(mx: Any) -> Any:
 
 
 def _document(mx: Any, material: Material, name: str, format: str) -> Any:
+    element = re.sub(r"\W", "_", name, flags=re.ASCII)  # names of elements, unlike files, are ASCII
     document = mx.createDocument()
     library = mx.createDocument()
     mx.loadLibraries(mx.getDefaultDataLibraryFolders(), mx.getDefaultDataSearchPath(), library)
     document.setDataLibrary(library)
     document.setColorSpace("lin_rec709")
-    graph = document.addNodeGraph(f"NG_{name}")
+    graph = document.addNodeGraph(f"NG_{element}")
     colour_space = "lin_rec709" if format == "exr" else "srgb_texture"
 
     def image(key: str, kind: str, colour: bool = False) -> Any:
@@ -117,35 +119,35 @@ def _document(mx: Any, material: Material, name: str, format: str) -> Any:
     if material.height is not None:
         output("height", image("height", "float"), "float")
         low, high = height_range(material.height)
-        displacement = document.addNode("displacement", f"{name}_relief", "displacementshader")
+        displacement = document.addNode("displacement", f"{element}_relief", "displacementshader")
         connect(displacement, displacement="height")
         displacement.setInputValue("scale", max(high - low, 1e-12), "float")
 
     alpha = graph.addNode("roughness_anisotropy", "alpha", "vector2")
     alpha.setConnectedNode("roughness", graph.getNode("image_roughness"))
     output("alpha", alpha, "vector2")
-    lambert = document.addNode("oren_nayar_diffuse_bsdf", f"{name}_lambert", "BSDF")
+    lambert = document.addNode("oren_nayar_diffuse_bsdf", f"{element}_lambert", "BSDF")
     connect(lambert, color="diffuse", normal="normal")
-    lobe = document.addNode("generalized_schlick_bsdf", f"{name}_lobe", "BSDF")
+    lobe = document.addNode("generalized_schlick_bsdf", f"{element}_lobe", "BSDF")
     connect(lobe, color0="specular", roughness="alpha", normal="normal")
-    both = document.addNode("add", f"{name}_bsdf", "BSDF")
+    both = document.addNode("add", f"{element}_bsdf", "BSDF")
     both.setConnectedNode("in1", lambert)
     both.setConnectedNode("in2", lobe)
-    surface = document.addNode("surface", f"{name}_surface", "surfaceshader")
+    surface = document.addNode("surface", f"{element}_surface", "surfaceshader")
     surface.setConnectedNode("bsdf", both)
 
-    standard = document.addNode("standard_surface", f"{name}_standard", "surfaceshader")
+    standard = document.addNode("standard_surface", f"{element}_standard", "surfaceshader")
     connect(standard, base_color="base", metalness="metalness", specular_roughness="roughness",
             normal="normal")  # fmt: skip
     standard.setInputValue("base", 1.0, "float")
-    open_pbr = document.addNode("open_pbr_surface", f"{name}_open_pbr_surface", "surfaceshader")
+    open_pbr = document.addNode("open_pbr_surface", f"{element}_open_pbr_surface", "surfaceshader")
     connect(open_pbr, base_color="base", base_metalness="metalness", geometry_normal="normal",
             specular_roughness="roughness", specular_weight="specular_weight")  # fmt: skip
     open_pbr.setInputValue("specular_ior", WHITE_IOR, "float")
     for suffix, shader in (
         ("", surface), ("_open_pbr", open_pbr), ("_standard_surface", standard)
     ):  # fmt: skip
-        key = name + suffix
+        key = element + suffix
         node = document.addMaterialNode(key, shader)
         if displacement is not None:
             node.setConnectedNode("displacementshader", displacement)

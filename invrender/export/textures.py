@@ -7,6 +7,7 @@ import os
 import re
 import struct
 import tempfile
+import unicodedata
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
@@ -149,8 +150,11 @@ def write_zip(folder: Path, out: Path) -> None:
 
 
 def safe_name(text: str) -> str:
-    """A name for files and materials of letters, digits, - and _: it cannot leave a folder."""
-    return re.sub(r"[^A-Za-z0-9_-]+", "_", text).strip("_")[:64] or "material"
+    """A name for files and materials of any script's letters, digits, - and _: it cannot leave a
+    folder, and is none that Windows keeps for devices."""
+    name = re.sub(r"[^\w-]+", "_", unicodedata.normalize("NFC", text)).strip("_")[:64]
+    reserved = re.fullmatch(r"(?i)con|prn|aux|nul|com\d|lpt\d", name)
+    return f"{name}_" if reserved else name or "material"
 
 
 def _png16(codes: NDArray[np.uint16], colour: bool, width: float | None) -> bytes:

@@ -27,7 +27,8 @@ def read_maps(folder: Path) -> Maps:
     )
 
 
-def write_maps(folder: Path, maps: Maps, *, half: bool = False) -> None:
-    """Write the four EXR files into a folder."""
+def write_maps(folder: Path, maps: Maps, *, half: bool = False, width: float | None = None) -> None:
+    """Write the four EXR files into a folder; width: of the sample, metres, for their headers."""
     for name, image in maps.encoded().items():
-        write_exr(Path(folder) / f"{name}.exr", image, half=half, data=name == "normal")
+        path = Path(folder) / f"{name}.exr"
+        write_exr(path, image, half=half, data=name == "normal", width=width)

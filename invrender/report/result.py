@@ -88,9 +88,10 @@ class Result:
         screen = lights.pattern_captured
         if screen is None:
             screen = lights.pattern * np.asarray(lights.gain, np.float32)
-        write_maps(folder, maps)
+        width = lights.rig.sample_size
+        write_maps(folder, maps, width=width)
         for key, image in sigma.items():
-            write_exr(folder / f"sigma_{key}.exr", image, data=True)
+            write_exr(folder / f"sigma_{key}.exr", image, data=True, width=width)
         for key, image in maps.encoded().items():
             write_png(folder / f"{key}.png", image, linear=key in ("normal", "roughness"))
         write_rig(folder / "rig.toml", lights.rig)
@@ -99,7 +100,7 @@ class Result:
         write_exr(folder / "pattern_captured.exr", screen)
         if lights.coverage is not None:
             write_exr(folder / "coverage.exr", lights.coverage)
-        write_exr(folder / "sample.exr", photo)
+        write_exr(folder / "sample.exr", photo, width=width)
         white = max(float(np.percentile(photo, 99.5)), 1e-12)
         write_png(folder / "photo.png", photo / white)
         write_png(folder / "render.png", rendering / white)

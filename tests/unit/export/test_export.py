@@ -256,6 +256,13 @@ def test_what_a_target_cannot_hold(maps, tmp_path, target):
 
 def test_names_from_files_stay_in_the_folder(maps, tmp_path):
     assert "/" not in safe_name("../../x") and safe_name("..") == "material"
+    assert [safe_name(n) for n in ("Ähre", "Öhre", "木", "A\u0308hre")] == [
+        "Ähre",
+        "Öhre",
+        "木",
+        "Ähre",
+    ]
+    assert safe_name("con") != "con" and safe_name("a/b") == "a_b"
     source = tmp_path / "source"
     source.mkdir()
     write_maps(source, maps)

@@ -72,8 +72,9 @@ def test_what_is_written_is_read_again(tmp_path, half):
 
 def test_maps_are_read_again(tmp_path):
     maps = constant_maps(6, 5, diffuse=0.3, specular=0.06, roughness=0.4)
-    write_maps(tmp_path, maps)
+    write_maps(tmp_path, maps, width=0.127)
     back = read_maps(tmp_path)
+    assert header(tmp_path / "diffuse.exr")["xDensity"] == pytest.approx(1)  # 5 pixels, 5 inches
     for name in ("diffuse", "specular", "roughness", "normal"):
         np.testing.assert_allclose(getattr(back, name), getattr(maps, name), atol=1e-6)
 
