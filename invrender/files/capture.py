@@ -63,22 +63,22 @@ def load_capture(folder: str | Path) -> Capture:
         raise InputError(f"{folder} has more than one photo ({found}); leave one")
     photo = read_photo(photos[0])
     check_photo(photo, str(photos[0]))
-    rig, files, fov_from, warnings, unknown = read_rig(folder / "rig.toml", fov=photo.fov)
-    pattern_path = _inside(folder, files.get("pattern") or _find_pattern(folder))
+    given = read_rig(folder / "rig.toml", fov=photo.fov)
+    pattern_path = _inside(folder, given.files.get("pattern") or _find_pattern(folder))
     pattern = read_image(pattern_path)
     if pattern.min() < 0 or pattern.max() > 1 + 1e-3:
         raise InputError(f"{pattern_path}: the pattern must be relative radiance in [0, 1]")
     if not pattern.max() > 0:
         raise InputError(f"{pattern_path}: the pattern is all black")
     truth = environment = None
-    if "sample" in files:
-        maps = _inside(folder, files["sample"])
+    if "sample" in given.files:
+        maps = _inside(folder, given.files["sample"])
         truth = read_maps(maps)
         if (maps / "environment.exr").is_file():
             environment = read_image(maps / "environment.exr")
     return Capture(
-        photo, rig, np.clip(pattern, 0, 1), truth, environment, fov_from,
-        (*photo.warnings, *warnings), folder.resolve().name, unknown,
+        photo, given.rig, np.clip(pattern, 0, 1), truth, environment, given.fov_from,
+        (*photo.warnings, *given.warnings), folder.resolve().name, given.unknown,
     )  # fmt: skip
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 import tomllib
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from invrender.files.write import atomic_path
 from invrender.rig import BALL_SHAPES, Rig, Vec3
@@ -35,7 +35,8 @@ LARGEST_SCREEN = 3.0
 _VECTORS = {f.name for f in fields(Rig) if f.type == "Vec3"}
 
 
-class RigFile(NamedTuple):
+@dataclass(frozen=True)
+class RigFile:
     """What ``rig.toml`` says.
 
     files: the names of the pattern and of the sample's true maps, where given. fov_from: where the

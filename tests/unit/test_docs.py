@@ -203,7 +203,7 @@ def test_the_guides_rig_is_read(tmp_path):
     guide = (ROOT / "docs/guide/capture.md").read_text("utf-8")
     (body,) = [body for kind, body in FENCE.findall(guide) if kind == "toml"]
     (tmp_path / "rig.toml").write_text(body)
-    assert read_rig(tmp_path / "rig.toml")[0] == Rig()
+    assert read_rig(tmp_path / "rig.toml").rig == Rig()
 
 
 def test_the_guides_python_runs(tmp_path):

@@ -88,7 +88,8 @@ def test_scale_does_not_matter():
 def test_file_round_trip(tmp_path):
     rig = Rig(0.2, 0.16, 0.01, 0.01, 60.0, (0.8, 0.85, 0.9), camera_tilt=(1.0, 2.0, 3.0))
     write_rig(tmp_path / "rig.toml", rig, "p.png", "truth/")
-    assert read_rig(tmp_path / "rig.toml")[:2] == (rig, {"pattern": "p.png", "sample": "truth/"})
+    found = read_rig(tmp_path / "rig.toml")
+    assert (found.rig, found.files) == (rig, {"pattern": "p.png", "sample": "truth/"})
 
 
 def test_fov_of_the_file_comes_before_that_of_the_exif(tmp_path):
