@@ -103,6 +103,7 @@ def parse(command: str) -> set[str]:
 
     Raises SystemExit if argparse refuses the command.
     """
+    command = re.sub(r"\$(\w|\{\w\})", "1", command)  # a shell's loop variable
     arguments = [PLACEHOLDERS.get(a, a) for a in shlex.split(command) if a not in ("...", "…")]
     if arguments[0] == "python":
         module, arguments = arguments[2], arguments[3:]
