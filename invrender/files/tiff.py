@@ -97,6 +97,8 @@ def _read_page(path: Path, page: tifffile.TiffPage, tags: dict[int, Any]) -> Ras
         raise InputError(f"{path} is a TIFF of {name} pixels; save it as RGB")
     if name == "SEPARATED" and _PROFILE not in page.tags:
         raise InputError(f"{path} is CMYK without a colour profile; save it as RGB")
+    if len(page.dataoffsets) < math.prod(page.chunked):
+        raise ValueError  # tifffile takes minutes over millions of tiles that are not there
     data = page.asarray()
     if page.planarconfig == 2 and data.ndim == 3:
         data = np.moveaxis(data, 0, -1)

@@ -424,6 +424,15 @@ def test_tiff_pages_and_thumbnails(tmp_path):
     refused(path, "dimensions|pixels")
 
 
+def test_a_tiff_without_most_of_its_tiles_is_refused_at_once(tmp_path):
+    """Of a width of millions, and a dozen tiles: it took minutes."""
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, made.codes(SCENE, 65535), photometric="rgb", tile=(16, 16))
+    with tifffile.TiffFile(path, mode="r+") as f:
+        f.pages[0].tags["ImageWidth"].overwrite(3_539_000)
+    refused(path, "not a readable TIFF")
+
+
 def test_tiff_alpha_aspect_and_orientation(tmp_path):
     path, alpha = tmp_path / "a.tif", np.full(SCENE.shape[:2], 0.5, np.float32)
     four = np.dstack([SCENE * 0.5, alpha])
