@@ -80,6 +80,9 @@ class Reconstructor:
         if max(photo.shape[:2]) > WHOLE:
             small = maps_of(resize(photo, *fitting(photo, WHOLE)), lambda share: None)
             found = joined(found, small)
+        if max(photo.shape[:2]) > COARSE:
+            coarse = maps_of(resize(photo, *fitting(photo, COARSE)), lambda share: None)
+            found = replace(found, coarse=coarse)
         return found
 
 
@@ -103,11 +106,19 @@ class Corrector:
         saturated. Ctrl-C ends it with what was found so far. ``progress`` is told the share done.
 
         What is shared by many pixels is judged best at the size of the training: beyond that
-        roughness takes its large shades from a step at `COARSE`, and of a photo larger than
-        `WHOLE` only the large shades are corrected."""
+        roughness takes its large shades from a step at `COARSE`; albedos' and roughness's large
+        shades are the mean of that and of what ``estimate.coarse`` is corrected to; and of a photo
+        larger than `WHOLE` only the large shades are corrected."""
         if max(photo.shape[:2]) > WHOLE:
             small, start, few = shrunk(WHOLE, photo, estimate, clipped)
             return joined(estimate, self(small, renderer, start, few, samples, progress))
+        if estimate.coarse:
+            small, _, few = shrunk(COARSE, photo, estimate, clipped)
+            own = replace(estimate, coarse=None)
+            fine = self(photo, renderer, own, clipped, samples, progress)
+            coarse = self(small, renderer, estimate.coarse, few, samples)
+            pooled = shaded(fine, coarse, ("diffuse", "specular", "roughness"), 1 / 2)
+            return replace(pooled, interrupted=fine.interrupted or coarse.interrupted)
         try:
             known = estimate.lobes
             lobes = known.maps if known else fit_lobes(photo, renderer, samples)

@@ -24,12 +24,14 @@ class Prediction(Estimate):
     """What a network estimates of a photo; where that says nothing the deviations are large.
 
     unit: the radiance of a white plane under the capture's lights. lobes: what
-    `invrender.refine.lobes` found of the photo, at most `WHOLE` pixels a side. interrupted: by
-    Ctrl-C, before all passes of the correction were done.
+    `invrender.refine.lobes` found of the photo, at most `WHOLE` pixels a side. coarse: what the
+    network estimates of the photo shrunk to `COARSE`, where it is larger. interrupted: by Ctrl-C,
+    before all passes of the correction were done.
     """
 
     unit: float
     lobes: Lobes | None = None
+    coarse: Prediction | None = None
     interrupted: bool = False
 
 
@@ -55,12 +57,15 @@ def resized(sigma: dict[str, Array], height: int, width: int) -> dict[str, Array
     return {k: resize(v, height, width) for k, v in sigma.items()}
 
 
-def shaded(estimate: Prediction, coarse: Prediction, names: Iterable[str]) -> Prediction:
-    """The estimate, whose maps ``names`` take from a coarser one all that this one can show."""
+def shaded(
+    estimate: Prediction, coarse: Prediction, names: Iterable[str], share: float = 1.0
+) -> Prediction:
+    """The estimate, whose maps ``names`` take from a coarser one ``share`` of the large shades, all
+    that this one can show, and keep the rest of their own."""
     own, maps = resize_maps(estimate.maps, *coarse.maps.shape), dict(vars(estimate.maps))
     for name in names:
         shades = getattr(coarse.maps, name) - getattr(own, name)
-        maps[name] = maps[name] + resize(shades, *estimate.maps.shape)
+        maps[name] = maps[name] + np.float32(share) * resize(shades, *estimate.maps.shape)
     diffuse, specular = np.clip(maps["diffuse"], 0, 1), np.clip(maps["specular"], 0, 1)
     roughness = np.clip(maps["roughness"], LEAST_MAP_ROUGHNESS, 1)
     normal = unit_normals(maps["normal"])

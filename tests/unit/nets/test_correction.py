@@ -181,6 +181,32 @@ def test_roughness_at_large_is_that_of_the_training_size(lit, monkeypatch):
     np.testing.assert_array_equal(both.diffuse, own.diffuse)
 
 
+def test_two_sizes_are_pooled(lit, monkeypatch):
+    """Large shades of albedos and roughness are the mean of both corrections; normals stay."""
+    renderer, photo = lit
+    monkeypatch.setattr("nets.predict.PASSES", 1)
+    monkeypatch.setattr("nets.predict.COARSE", SIZE // 2)
+    corrector = Corrector.__new__(Corrector)
+    corrector.network = restless()
+    low = (SIZE // 2, SIZE // 2)
+    start = guess()
+    small = replace(
+        start,
+        maps=resize_maps(constant_maps(*start.maps.shape, 0.2, 0.1, 0.3), *low),
+        sigma={k: resize(v, *low) for k, v in start.sigma.items()},
+    )
+    fine = corrector(photo, renderer, start).maps
+    coarse = corrector(resize(photo, *low), renderer, small).maps
+    both = corrector(photo, renderer, replace(start, coarse=small)).maps
+    for name in ("diffuse", "specular", "roughness"):
+        own = getattr(fine, name)
+        shades = resize(getattr(coarse, name) - resize(own, *low), SIZE, SIZE)
+        assert np.abs(shades).max() > 0.05
+        mean = np.clip(own + shades / 2, 0, 1)
+        np.testing.assert_allclose(getattr(both, name), mean, atol=1e-5)
+    np.testing.assert_allclose(both.normal, fine.normal, atol=1e-6)
+
+
 def restless():
     """A correction that changes something at every pass."""
     torch.manual_seed(2)
