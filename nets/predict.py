@@ -114,8 +114,8 @@ class Corrector:
             return joined(estimate, self(small, renderer, start, few, samples, progress))
         if estimate.coarse:
             small, _, few = shrunk(COARSE, photo, estimate, clipped)
-            own = replace(estimate, coarse=None)
-            fine = self(photo, renderer, own, clipped, samples, progress)
+            alone = replace(estimate, coarse=None)
+            fine = self(photo, renderer, alone, clipped, samples, progress)
             coarse = self(small, renderer, estimate.coarse, few, samples)
             pooled = shaded(fine, coarse, ("diffuse", "specular", "roughness"), 1 / 2)
             return replace(pooled, interrupted=fine.interrupted or coarse.interrupted)
