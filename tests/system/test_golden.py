@@ -4,8 +4,9 @@
 is meant to move them, and prints how far each moved; commit it together with that change.
 
 On one machine the maps are the same to 1e-6. Between processors vector instructions round
-differently: with those of AVX-512 forbidden to numpy, OpenBLAS and torch, the worst pixel of the
-four runs moves by 2.4e-4 and no map by more than 2e-6 on average.
+differently. With those of AVX-512 forbidden to numpy, OpenBLAS and torch, the worst pixel without
+networks moves by 1.3e-4 and its maps by less than 1e-6 on average; with networks, whose posterior
+weighs alternatives, by 0.022 and 3.1e-4.
 """
 
 import shutil
@@ -27,8 +28,8 @@ from invrender.maps import NAMES
 GOLDEN = Path(__file__).parent / "golden"
 SIZE = 32  # pixels a side of the maps
 RUNS = ("network", "flat", "jpeg", "pair")
-# Ten times what other vector instructions change, see above.
-WORST_PIXEL, WORST_MEAN = 2.5e-3, 5e-5
+# Of a map's worst pixel, and of its mean change: a few times what vector instructions change.
+FLAT_TOLERANCE, NETWORK_TOLERANCE = (1e-3, 1e-5), (0.06, 1e-3)
 
 
 def jpeg_capture(folder):
@@ -84,11 +85,12 @@ def pinned(out):
 @pytest.mark.parametrize("run", RUNS)
 def test_maps_are_the_pinned_ones(run, tmp_path, example_result):
     known = run in ("network", "flat")
+    pixel, mean = FLAT_TOLERANCE if run == "flat" else NETWORK_TOLERANCE
     out = example_result(run) if known else refined(run, tmp_path / run)
     with np.load(GOLDEN / "maps.npz") as golden:
         for name, found in pinned(out).items():
             moved = np.abs(found - golden[f"{run}/{name}"])
-            assert moved.max() < WORST_PIXEL and moved.mean() < WORST_MEAN, name
+            assert moved.max() < pixel and moved.mean() < mean, name
 
 
 def write():
