@@ -409,7 +409,7 @@ def _mirrored_table(rig: Rig, circle: Array, normal: Array) -> tuple[Array, Arra
 def _look_up(levels: Array, level: Array | int, at: Array) -> Array:
     """Bilinear look-ups (n, 3) in the chosen level at positions (n, 2), the border repeated."""
     h, w = levels.shape[1:3]
-    x, y = np.clip(at[:, 0] - 0.5, 0, w - 1.001), np.clip(at[:, 1] - 0.5, 0, h - 1.001)
+    x, y = np.clip(at[:, 0] - 0.5, 0, w - 1 - TINY), np.clip(at[:, 1] - 0.5, 0, h - 1 - TINY)
     i, j = y.astype(int), x.astype(int)
     fy, fx = (y - i)[:, None], (x - j)[:, None]
     top = levels[level, i, j] * (1 - fx) + levels[level, i, j + 1] * fx
@@ -492,7 +492,7 @@ def _climb(view: View, rig: Rig, start: Array, reach: float, blur: int, evaluati
 
 
 def _features(view: View, rig: Rig, circle: Array) -> Array:
-    """Six numbers (6,) that tell a ball from other round things.
+    """Six numbers (6,) that distinguish a ball from other round things.
 
     The shares of edge along horizon and outline; the mirrored table's fit; the offset of that fit
     (a printed ring is as light as the table, a mirror darker by its reflectance); how much more

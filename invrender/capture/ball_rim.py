@@ -25,9 +25,10 @@ from scipy import ndimage
 
 from invrender.capture.ball_image import sample_image
 from invrender.capture.ball_view import View, edges, horizon_curve, normals, outline_curve
+from invrender.capture.least_squares import minimise
 from invrender.capture.mirror import ball_centre
 from invrender.capture.robust import spread as robust_spread
-from invrender.capture.settings import LUMINANCE, RIM_FIT, TINY
+from invrender.capture.settings import LUMINANCE, RIM_FIT
 from invrender.rig import Rig
 from invrender.types import Array, Mask
 
@@ -320,27 +321,27 @@ class _Lines:
         self, p: Array, turns: int, spread: float, edge: float
     ) -> tuple[float, Array, Array]:
         """Steps from ``p`` on: the cost, the unknowns, their information in `units`."""
-        start = self.solve(p, spread, edge, None)
-        fit = self.solve(p, spread, edge, start.weight)
-        damping = 1e-3
-        information, gradient = self.normal_equations(p, fit, spread, edge)
-        for _ in range(turns):
-            for _ in range(4):
-                damped = information + np.diag(np.diag(information)) * damping
-                step = -np.linalg.solve(damped, gradient)
-                step *= min(1, RIM_FIT.longest_step / max(np.abs(step).max(), TINY))
-                tried = self.solve(p + step @ self.units, spread, edge, fit.weight)
-                if tried.cost < fit.cost:
-                    break
-                damping *= 8
-            else:
-                break
-            gained = fit.cost - tried.cost
-            p, fit, damping = p + step @ self.units, tried, max(damping / 5, 1e-4)
-            information, gradient = self.normal_equations(p, fit, spread, edge)
-            if gained < RIM_FIT.least_gain:
-                break
-        return fit.cost, p, information
+
+        def evaluate(steps: Array, fit: _Fit | None) -> tuple[float, _Fit]:
+            at = p + steps @ self.units
+            weight = self.solve(at, spread, edge, None).weight if fit is None else fit.weight
+            new = self.solve(at, spread, edge, weight)
+            return new.cost, new
+
+        def equations(steps: Array, fit: _Fit) -> tuple[Array, Array]:
+            matrix, gradient = self.normal_equations(p + steps @ self.units, fit, spread, edge)
+            return matrix, -gradient
+
+        found = minimise(
+            np.zeros(len(p)),
+            evaluate,
+            equations,
+            steps=turns,
+            longest=RIM_FIT.longest_step,
+            enough=lambda gained, cost: gained < RIM_FIT.least_gain,
+        )
+        information, _ = equations(found.unknowns, found.state)
+        return found.cost, p + found.unknowns @ self.units, information
 
     def normal_equations(
         self, p: Array, fit: _Fit, spread: float, edge: float

@@ -1,6 +1,6 @@
 """Lamps that a photo clips, made as bright as the table around the sample says they are.
 
-A clipped pixel tells only that there was at least so much light. But room and screen light the
+A clipped pixel says only that there was at least so much light. But room and screen light the
 table as well, and the screen's share of that, whose radiance the ball shows, has a shape and
 colours of its own: the brighter the room, the flatter and less coloured the table's shading.
 """

@@ -17,6 +17,7 @@ from scipy import ndimage, special
 from scipy.spatial.transform import Rotation
 
 from invrender.capture.ball_image import BallImage, screen_coordinates, trace_ball
+from invrender.capture.least_squares import minimise
 from invrender.capture.robust import spread as robust_spread
 from invrender.capture.settings import JPEG_GAMMA, JPEG_LUMA, SCREEN_FIT, TINY
 from invrender.files.images import Photo
@@ -323,28 +324,21 @@ class _Fit:
         """
         self.focus(blurred)
         self.prepare(u)
-        cost = self.cost(u)
-        damping = 1e-3
-        for _ in range(SCREEN_FIT.steps):
-            matrix, right = self.normal_equations(u)
-            eased = damping / 8
-            for _ in range(6):
-                damped = matrix + np.diag(np.diag(matrix) * damping + SCREEN_FIT.ridge)
-                step = np.zeros(_COUNT)
-                step[self.free] = np.linalg.solve(damped, right)
-                step *= min(1, SCREEN_FIT.longest_step / max(np.abs(step).max(), TINY))
-                tried = u + step
-                gained = cost - self.cost(tried)
-                if gained > 0:
-                    break
-                damping *= 8
-                eased = damping
-            else:
-                break
-            u, cost, damping = tried, cost - gained, eased
-            if gained < least * cost:
-                break
-        return u
+
+        def whole(free: Array) -> Array:
+            unknowns = u.copy()
+            unknowns[self.free] = free
+            return unknowns
+
+        found = minimise(
+            u[self.free],
+            lambda free, _: (self.cost(whole(free)), None),
+            lambda free, _: self.normal_equations(whole(free)),
+            steps=SCREEN_FIT.steps,
+            longest=SCREEN_FIT.longest_step,
+            enough=lambda gained, cost: gained < least * (cost - gained),
+        )
+        return whole(found.unknowns)
 
     def prepare(self, u: Array) -> None:
         """The room behind the screen, the pixels to compare and what to expect of their errors, for

@@ -17,6 +17,16 @@ JPEG_GAMMA = 2.2  # exponent of a JPEG's encoding, about; sRGB
 
 
 @dataclass(frozen=True)
+class DampedSteps:
+    """Levenberg's and Marquardt's damping: `invrender.capture.least_squares`."""
+
+    first: float = 1e-3  # of the matrix's diagonal; by hand
+    factor: float = 8.0  # by which it rises where the cost does, and falls again; by hand
+    attempts: int = 6  # of a step, before it is the last; by hand
+    ridge: float = 1e-9  # added to the diagonal, where nothing determines an unknown; by hand
+
+
+@dataclass(frozen=True)
 class BallView:
     """The part of a photo around the ball, as the search sees it."""
 
@@ -50,7 +60,7 @@ class BallSearch:
     same: float = 0.003  # radii between two fits that agree; by hand
     mirror_weight: float = 1.0  # of the mirrored table's fit in the score; by hand
     outline_weight: float = 0.5  # of the outline beside the horizon, likewise; by hand
-    tilted_confidence: float = 0.9  # at most, where no square tells the camera's tilt; by hand
+    tilted_confidence: float = 0.9  # at most, where no square shows the camera's tilt; by hand
     radius_error: float = 0.0012  # of the radius: an expected error of half the doubt; by hand
     doubt: float = 0.4  # of the confidence, lost where the radius is unsure; by hand
     other_radii: tuple[float, float] = (0.93, 1.07)  # of the best fit's, also tried; by hand
@@ -61,7 +71,7 @@ class BallSearch:
     coarse_blur: float = 1.5  # pixels, of the edges in the coarse search; by hand
     peak_window: int = 5  # pixels of the coarse search's grid; by hand
     distinct: tuple[float, float] = (6.0, 0.05)  # pixels, of the radius: two places; by hand
-    noise_traces: float = 3.0  # of the usual edge strength, added to an edge's; by hand
+    noise_traces: float = 3.0  # of the median edge strength, added to an edge's; by hand
     # Reach in radii, blur level and evaluations of the climbs: first all candidates, then the best.
     climb_first: tuple[float, int, int] = (0.08, 2, 25)  # by hand
     climbs: tuple[tuple[float, int, int], ...] = ((0.04, 1, 40), (0.02, 0, 40))  # by hand
@@ -109,7 +119,7 @@ class RimFit:
 
     points_a_pixel: int = 3  # of a line, to each of the view's pixels; by hand
     node_spacing: float = 0.014  # radii, of the unknown table's nodes; by hand
-    roughness: float = 0.03  # of the median: the table's usual second difference; by hand
+    roughness: float = 0.03  # of the median: the table's typical second difference; by hand
     nearest: float = 0.80  # radii where the lines begin; by hand
     farthest: float = 3.0  # radii to which the table is looked up; by hand
     # Lines, blur in the view's pixels, radii to which the table is unknown, steps at most, radii to
@@ -133,7 +143,7 @@ class RimFit:
     edges_correlated: float = 10.0  # the same, of the horizon's edges; by hand
     horizon_points: int = 120  # of the horizon's curve; by hand
     horizon_reach: tuple[float, float] = (2.0, 0.05)  # pixels at least, radii; by hand
-    strong_edge: float = 0.1  # weight of an edge that tells the spread; by hand
+    strong_edge: float = 0.1  # weight of an edge that counts for the spread; by hand
     steps: tuple[float, ...] = (2e-3, 2e-3, 2e-3, 0.1, 0.1, 0.05, 0.01)  # radii, degrees, logs
     position_precision: float = 1e-9  # of the prior on place and radius; by hand
     margin: float = 4.0  # pixels of a line beyond its samples; by hand
@@ -180,7 +190,7 @@ class SquareFit:
     whole: float = 10.0  # ratio; by hand
     nominal: float = 12.0  # ratio to the median, from which the rig's own square is seen; by hand
     better: float = 1.8  # sum of four logarithms, from which another square is the one; by hand
-    least_side: int = 32  # pixels of a side that tells anything; by hand
+    least_side: int = 32  # pixels of a side that can be seen; by hand
     least_move: float = 0.004  # sides; a smaller one is not believed; by hand
     found_tilt: float = 0.3  # degrees, expected error of the tilt by the square; by hand
     unseen_tilt: float = 2.0  # degrees, expected tilt where no square is seen; by hand
@@ -196,7 +206,7 @@ class SquareFit:
     wide: tuple[float, float, float] = (60, 3.0, 20.0)  # pixels, as `near`; by hand
     tenth: float = 0.9  # quantile; by hand
     least_power: tuple[float, float, float] = (1e-3, 1e-4, 1e-9)  # on, beside, whole; by hand
-    even: tuple[float, float] = (4.0, 1e-6)  # of the usual change, absolute; by hand
+    even: tuple[float, float] = (4.0, 1e-6)  # of the median change, absolute; by hand
 
 
 @dataclass(frozen=True)
@@ -225,7 +235,7 @@ class FieldOfView:
 
 @dataclass(frozen=True)
 class Cropping:
-    """What tells a photo that was cropped: `invrender.capture.orientation`."""
+    """How a cropped photo is recognised: `invrender.capture.orientation`."""
 
     # Width over height of whole photos, the longer side first; what cameras and phones have.
     ratios: tuple[float, ...] = (1.0, 5 / 4, 4 / 3, 7 / 5, 3 / 2, 16 / 10, 16 / 9, 2.0)
@@ -312,11 +322,10 @@ class ScreenFit:
     least_share: float = 1e-6  # of the room in a window, in a quotient; by hand
     dark_noise: float = 0.02  # of the gain, added to the shot noise's level; by hand
     least_noise: float = 0.003  # of the shot noise's scale; by hand
-    first_noise: float = 0.1  # of it, where nothing tells it; by hand
+    first_noise: float = 0.1  # of it, where nothing shows it; by hand
     least_radiance: tuple[float, float] = (1e-6, 1e-3)  # linear, encoded; by hand
     least_width: float = 1e-6  # of a sub-pixel on the screen; by hand
     last_cell: float = 1.001  # cells from the pattern's border in a look-up; by hand
-    ridge: float = 1e-9  # on the unknowns; by hand
     longest_step: float = 0.5  # of the unknowns; by hand
     steps: int = 60  # at most; by hand
 
@@ -333,7 +342,7 @@ class PatternCheck:
     least_shift: float = 0.022  # sizes of the sample
     least_tilt: float = 1.0  # degrees
     captured_size: int = 256  # pixels a side, at most, of the pattern as the ball shows it; by hand
-    room_saturated: float = 0.001  # share of the room that is worth a notice; by hand
+    room_saturated: float = 0.001  # share of the room that makes a notice; by hand
 
 
 @dataclass(frozen=True)
@@ -416,6 +425,7 @@ class Crop:
     tolerance: float = 0.5  # pixels that the sample may reach beyond the photo; by hand
 
 
+DAMPED_STEPS = DampedSteps()
 BALL_VIEW = BallView()
 BALL_SEARCH = BallSearch()
 MIRRORED_TABLE = MirroredTable()
