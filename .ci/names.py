@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 SHARED_CONSTANTS = 0  # names
-UNNAMED_FLOATS = 45  # at most
+UNNAMED_FLOATS = 40  # at most
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("invrender", "nets")

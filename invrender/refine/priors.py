@@ -20,6 +20,26 @@ from invrender.types import Array
 ERROR_INFLATION = np.array([2.05] * 3 + [1.1] * 3 + [1.1] + [1.35] * 2, np.float32)
 
 
+@dataclass(frozen=True)
+class Spreads:
+    """How far a pixel's parameters lie from its material's, as standard deviations; all chosen by
+    hand. Pairs: a constant part, and a share of the albedo."""
+
+    lobe_diffuse: tuple[float, float] = (0.01, 0.05)  # of maps found without a network
+    lobe_specular: tuple[float, float] = (0.002, 0.05)  # of these, times the share of metal
+    metal_f0: tuple[float, float] = (0.06, 0.36)  # k_s of no metal, and of nothing but metal
+    lobe_roughness: float = 0.02
+    lobe_slope: float = 0.05
+    lobe_correlation: tuple[float, float] = (0.98, 0.95)  # of the channels of k_d, and of k_s
+    network_diffuse: tuple[float, float] = (0.01, 0.15)  # of a network's maps, at most
+    network_specular: tuple[float, float] = (0.01, 0.3)
+    network_correlation: tuple[float, float] = (0.9, 0.95)
+    least: float = 1e-4  # of what a network expects of its errors
+
+
+WITHIN_MATERIAL = Spreads()
+
+
 @dataclass
 class Prior:
     """mean, sigma: (H, W, 9) in the order of θ; correlation: (9, 9), of the deviations.
@@ -34,19 +54,20 @@ class Prior:
     total: Array | None = None
 
 
-def lobe_prior(maps: Maps) -> Prior:
+def lobe_prior(maps: Maps, spreads: Spreads = WITHIN_MATERIAL) -> Prior:
     """The uncertainty within a material of maps from `invrender.refine.lobes`: mostly shade and
     relief."""
     mean = to_theta(maps)
     sigma = np.zeros_like(mean)
-    metal = np.clip((maps.specular - 0.06) / 0.3, 0, 1)
-    sigma[..., D] = 0.01 + 0.05 * maps.diffuse
-    sigma[..., S] = 0.002 + 0.05 * metal
-    sigma[..., R], sigma[..., N] = 0.02, 0.05
-    return Prior(mean, sigma, _correlation(0.98, 0.95))
+    none, all_ = spreads.metal_f0
+    metal = np.clip((maps.specular - none) / (all_ - none), 0, 1)
+    sigma[..., D] = spreads.lobe_diffuse[0] + spreads.lobe_diffuse[1] * maps.diffuse
+    sigma[..., S] = spreads.lobe_specular[0] + spreads.lobe_specular[1] * metal
+    sigma[..., R], sigma[..., N] = spreads.lobe_roughness, spreads.lobe_slope
+    return Prior(mean, sigma, _correlation(*spreads.lobe_correlation))
 
 
-def network_prior(maps: Maps, sigma: dict[str, Array]) -> Prior:
+def network_prior(maps: Maps, sigma: dict[str, Array], spreads: Spreads = WITHIN_MATERIAL) -> Prior:
     """The uncertainty of a network's maps, from what it expects of its errors, (H, W) a map.
 
     ``sigma`` of normals is that of n/2 + 1/2. An albedo's error within a material is at most a
@@ -58,12 +79,15 @@ def network_prior(maps: Maps, sigma: dict[str, Array]) -> Prior:
     nominal[..., D], nominal[..., S] = (sigma[k][..., None] for k in ("diffuse", "specular"))
     nominal[..., R] = sigma["roughness"]
     nominal[..., N] = 2 * sigma["normal"][..., None]
-    nominal = np.maximum(nominal, 1e-4)
+    nominal = np.maximum(nominal, spreads.least)
     total = ERROR_INFLATION * nominal
     spread = total / ERROR_INFLATION.max()
-    spread[..., D] = np.minimum(spread[..., D], 0.01 + 0.15 * maps.diffuse)
-    spread[..., S] = np.minimum(spread[..., S], 0.01 + 0.3 * maps.specular)
-    return Prior(mean, spread, _correlation(0.9, 0.95), total)
+    for k, albedo, (constant, share) in (
+        (D, maps.diffuse, spreads.network_diffuse),
+        (S, maps.specular, spreads.network_specular),
+    ):
+        spread[..., k] = np.minimum(spread[..., k], constant + share * albedo)
+    return Prior(mean, spread, _correlation(*spreads.network_correlation), total)
 
 
 def _correlation(diffuse: float, specular: float) -> Array:
