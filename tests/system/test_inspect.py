@@ -65,10 +65,12 @@ def test_inspect_refuses(folder, arguments, match, capsys, monkeypatch):
 
 def test_a_ball_without_the_pattern_is_refused(folder, tmp_path, capsys):
     """Another pattern than the one shown, or something that is no ball."""
+    capture = tmp_path / "capture"
+    capture.mkdir()
     for name in ("photo.exr", "rig.toml"):
-        (tmp_path / name).write_bytes((folder / name).read_bytes())
-    write_exr(tmp_path / "pattern.exr", blocks(seed=9))
-    assert main(["inspect", str(tmp_path), "-o", str(tmp_path / "out")]) == 2
+        (capture / name).write_bytes((folder / name).read_bytes())
+    write_exr(capture / "pattern.exr", blocks(seed=9))
+    assert main(["inspect", str(capture), "-o", str(tmp_path / "out")]) == 2
     assert "does not show the pattern" in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "out").exists()
 
