@@ -255,7 +255,9 @@ class BallShape:
 class TableLevel:
     """The table's tilt against the camera: `invrender.capture.lights.level_table`."""
 
-    least_tilt: float = 1.1  # degrees; a smaller one is an error of the rim's fit; by hand
+    # Degrees; a smaller one is an error of the rim's fit. Of 34 noisy photographs with a straight
+    # camera two were found tilted by 1.1 and 1.2, the others by no more than four deviations.
+    least_tilt: float = 1.5
     least_deviations: float = 4.0  # of the rim's fit, likewise; its errors are twice these; by hand
 
 
