@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from invrender.capture.ball import find_ball
+from invrender.capture.ball import find_ball, measure_reflectance
 from invrender.capture.ball_image import unfold_pattern
 from invrender.capture.camera import find_camera
 from invrender.capture.mirror import Ball, make_ball, place_ball
@@ -38,6 +38,7 @@ def find_ball_and_orientation(
     as it is, in pixels. Raises `InputError` as `find_ball` does, and where a ball that was not
     given by hand shows something else than the pattern.
     """
+    found: list[tuple[Capture, Ball, tuple[Notice, ...]]] = []
     fallback: tuple[Capture, Ball, float] | None = None
     problem: InputError | None = None
     photo = capture.photo
@@ -59,7 +60,8 @@ def find_ball_and_orientation(
             resize_pattern(here.pattern, ORIENTATION.cells),
         )
         if expected > 1 - ORIENTATION.better:  # no orientation can be so much more alike
-            return here, ball, _notices(first, 0, False)
+            found.append((here, ball, _notices(first, 0, False)))
+            break
         nominal = replace(nominal, rig=replace(nominal.rig, ball_shape=here.rig.ball_shape))
         (turn, quarter, mirrored), alike = _best_orientation(nominal, ball)
         if alike > ORIENTATION.alike and alike > expected + ORIENTATION.better:
@@ -72,9 +74,17 @@ def find_ball_and_orientation(
             ball = replace(
                 moved, position=again.position, radius_m=again.radius_m, ellipse=again.ellipse
             )
-            return here, ball, _notices((first + turn) % 4, quarter, mirrored)
+            # The first rig had the screen and the camera on another side.
+            ball = measure_reflectance(here.photo, here.rig, ball)
+            found.append((here, ball, _notices((first + turn) % 4, quarter, mirrored)))
+            if turn % 2 == 0:
+                break
+            # By a quarter the field of view went to the other side; the next round asks whether
+            # it was that side's from the start, which a ball of unknown shape can hide.
         if first == 0:
             fallback = here, ball, expected
+    if found:
+        return max(found, key=lambda one: one[1].confidence)
     if fallback is None:
         assert problem is not None
         raise _explained(problem, capture) from None

@@ -57,12 +57,11 @@ def run(args: argparse.Namespace, console: Console) -> int:
         photo = read_photo(args.capture)
         check_photo(photo, str(args.capture))
         rig = Rig() if photo.fov is None else Rig(fov=photo.fov)
-        fov_from = "unknown" if photo.fov is None else "exif"
         capture = Capture(
             photo,
             rig,
             default_pattern(),
-            fov_from=fov_from,
+            fov_from="rig" if photo.fov is None else "exif",
             warnings=photo.warnings,
             unknown=FOUND_IN_PHOTO,
         )

@@ -142,7 +142,7 @@ def test_simulate_writes_what_refine_reads(tmp_path, capsys):
     assert {p.name for p in folder.iterdir()} == {"photo.exr", "pattern.exr", "rig.toml", "truth"}
     assert read_maps(folder / "truth").shape == (64, 64)
     assert main([*command, "--width", "320", "--spp", "4"]) == 2  # not over what exists
-    assert "not empty" in capsys.readouterr().err
+    assert "holds a capture" in capsys.readouterr().err
     assert main(["simulate", "-o", str(tmp_path / "x"), "--kind", "cheese"]) == 2
     assert not (tmp_path / "x").exists()
 
