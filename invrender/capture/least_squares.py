@@ -8,7 +8,8 @@ prior beside a robust loss, and are made of normal equations: 14 unknowns and 30
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Generic, NamedTuple, TypeVar
+from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -18,7 +19,8 @@ from invrender.types import Array
 State = TypeVar("State")
 
 
-class Minimum(NamedTuple, Generic[State]):
+@dataclass(frozen=True)
+class Minimum(Generic[State]):
     """Where `minimise` ended: the unknowns (n,), what the cost was made from, and the cost."""
 
     unknowns: Array
