@@ -75,6 +75,9 @@ class Result:
                     return
                 # Without its report a folder is no result: neither the old one nor the new.
                 (out / "report.json").unlink(missing_ok=True)
+                # The one file that a result may lack: an older result's would be read as its own.
+                if self.lights.coverage is None:
+                    (out / "coverage.exr").unlink(missing_ok=True)
                 for file in sorted(new.iterdir(), key=lambda f: f.name == "report.json"):
                     os.replace(file, out / file.name)
         except OSError as error:

@@ -123,6 +123,14 @@ def test_draw_training_data():
     assert samples[0]["photo"].shape == (3, 32, 32)
 
 
+def test_a_result_takes_nothing_from_the_one_that_it_replaces(result, tmp_path):
+    """Lights that a person states have no coverage, which those from a ball have."""
+    result.save(tmp_path / "out")
+    stated = replace(result, lights=replace(result.lights, coverage=None))
+    stated.save(tmp_path / "out")
+    assert invrender.Result.load(tmp_path / "out").lights.coverage is None
+
+
 def test_simulate_and_load(tmp_path):
     from invrender.data import procedural_environment, procedural_material
     from invrender.pattern.default import default_pattern
