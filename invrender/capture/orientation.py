@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from invrender.capture.ball import find_ball, measure_reflectance
+from invrender.capture.ball import find_ball
 from invrender.capture.ball_image import unfold_pattern
 from invrender.capture.camera import find_camera
 from invrender.capture.mirror import Ball, make_ball, place_ball
@@ -74,8 +74,6 @@ def find_ball_and_orientation(
             ball = replace(
                 moved, position=again.position, radius_m=again.radius_m, ellipse=again.ellipse
             )
-            # The first rig had the screen and the camera on another side.
-            ball = measure_reflectance(here.photo, here.rig, ball)
             found.append((here, ball, _notices((first + turn) % 4, quarter, mirrored)))
             if turn % 2 == 0:
                 break

@@ -9,7 +9,7 @@ from invrender.refine.flat import USUAL_ROUGHNESS, plane_terms
 from invrender.render.renderer import Renderer
 from invrender.types import Array
 
-BLOCKS = 16  # parts a side, whose means the coarse error and chi² compare
+BLOCKS = 16  # parts a side, whose means the coarse error compares
 
 
 def photo_error(picture: Array, photo: Array, clipped: NDArray[np.bool_]) -> float:

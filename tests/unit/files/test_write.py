@@ -174,3 +174,6 @@ def test_a_failed_write_keeps_the_old_file(tmp_path):
         raise RuntimeError
     assert (tmp_path / "a.png").read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["a.png"]
+    with pytest.raises(ValueError, match="non-finite"):
+        write_exr(tmp_path / "b.exr", np.full((2, 2, 3), np.inf))
+    assert [p.name for p in tmp_path.iterdir()] == ["a.png"]
