@@ -40,7 +40,8 @@ def page(folder: Path = RESULTS) -> str:
         results = read_results(file.stem, folder)
         benchmark = results["command"].split()[3]
         parts.append(f"## {file.stem}\n\n{questions[benchmark]}\n")
-        parts.append(f"`{results['command']}`, {_machine(results['machine'])}.\n")
+        version = f"commit {results['commit']}" if results["commit"] else "an earlier version"
+        parts.append(f"`{results['command']}`, {version}, {_machine(results['machine'])}.\n")
         if "note" in results:
             parts.append(results["note"] + "\n")
         for name, table in results["tables"].items():
