@@ -8,7 +8,7 @@ import pytest
 
 HEAVY = {
     "torch", "kornia", "drjit", "mitsuba", "matplotlib", "scipy", "skimage", "numpy", "PIL",
-    "OpenEXR", "jinja2", "rich", "nets",
+    "OpenEXR", "jinja2", "rich", "cv2", "nets",
 }  # fmt: skip
 HELP = "import runpy, sys; sys.argv[1:] = ['--help']; runpy.run_module('invrender')"
 
@@ -59,4 +59,4 @@ def test_small_parts_load_small_parts():
         "from invrender import Capture, InputError, Lights, Maps, Rig, find_lights, load_capture"
         + LISTED
     )
-    assert not set(eval(run(code))) & {"torch", "kornia", "drjit", "mitsuba", "matplotlib", "nets"}
+    assert not set(eval(run(code))) & {"torch", "kornia", "drjit", "mitsuba", "matplotlib", "cv2", "nets"}
