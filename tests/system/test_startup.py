@@ -59,4 +59,12 @@ def test_small_parts_load_small_parts():
         "from invrender import Capture, InputError, Lights, Maps, Rig, find_lights, load_capture"
         + LISTED
     )
-    assert not set(eval(run(code))) & {"torch", "kornia", "drjit", "mitsuba", "matplotlib", "cv2", "nets"}
+    assert not set(eval(run(code))) & {
+        "torch",
+        "kornia",
+        "drjit",
+        "mitsuba",
+        "matplotlib",
+        "cv2",
+        "nets",
+    }
