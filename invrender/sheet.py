@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from invrender.rig import Rig
 from invrender.types import Array, InputError
@@ -47,7 +48,7 @@ class Sheet:
     square hole for the sample, around the origin; ball: the place (x, y) and radius of the ball.
     """
 
-    ids: Array
+    ids: NDArray[np.int_]
     corners: Array
     white: Array
     white_side: float
@@ -156,13 +157,13 @@ def marker_dictionary() -> Any:
     return aruco.getPredefinedDictionary(getattr(aruco, DICTIONARY))
 
 
-def marker_bits(ids: Array) -> Array:
+def marker_bits(ids: NDArray[np.int_]) -> NDArray[np.int_]:
     """Black (0) and white (1) squares of markers, (n, 7, 7), row 0 on top."""
     from cv2 import aruco
 
     dictionary = marker_dictionary()
     bits = [aruco.generateImageMarker(dictionary, int(i), MODULES) for i in ids]
-    return np.stack(bits) // 255
+    return np.asarray(bits, int) // 255
 
 
 def draw_sheet(sheet: Sheet, resolution: float) -> Array:

@@ -61,7 +61,8 @@ def test_the_picture_has_the_markers_where_the_geometry_says():
     for number, found in zip(ids.ravel(), corners, strict=True):
         pixels = found[0] + 0.5  # OpenCV counts from a pixel's middle
         at = [sheet.page[0], sheet.page[3]] + pixels / resolution * [1, -1]
-        assert np.abs(at - where[number]).max() < 1.0 / resolution
+        assert np.abs(at - where[number]).max() < 1.5 / resolution  # the corners of whole pixels
+        assert np.abs((at - where[number]).mean(0)).max() < 0.75 / resolution
 
 
 def test_the_picture_keeps_its_ink_at_any_resolution():
