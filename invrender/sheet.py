@@ -7,7 +7,6 @@ rig's coordinates, and `draw_sheet` makes a picture of it. `invrender.pattern.gu
 
 from __future__ import annotations
 
-import hashlib
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -29,6 +28,7 @@ UNPRINTED = 0.006  # metres along the paper's edges where printers may leave not
 DICTIONARY = "DICT_5X5_1000"
 MODULES = 7  # black or white squares across a marker
 FAMILY = 100  # numbers that a sheet takes of the dictionary's thousand
+FAMILY_STEP = 1.1  # ratio of two samples' sizes whose sheets have other numbers
 
 MARKER = 0.15  # sides of the sample: a marker's
 BORDER = 0.07  # the same, of plain paper between the window and the markers
@@ -144,10 +144,9 @@ def _white(corners: Array, rig: Rig, page: tuple[float, ...], side: float) -> Ar
 
 
 def _family(rig: Rig) -> int:
-    """Which of the dictionary's ten families of markers a rig's sheet has: one sheet is not taken
-    for another's enlargement."""
-    sizes = f"{rig.sample_size:.4g} {rig.optical_axis_x:.4g} {rig.ball_radius:.3g}"
-    return hashlib.sha256(sizes.encode()).digest()[0] % 10
+    """Which of the dictionary's ten families of markers a rig's sheet has: sheets whose sizes differ
+    by `FAMILY_STEP` or more are not taken for each other's enlargement."""
+    return math.floor(math.log(rig.sample_size) / math.log(FAMILY_STEP)) % 10
 
 
 def marker_dictionary() -> Any:
