@@ -144,8 +144,8 @@ def _white(corners: Array, rig: Rig, page: tuple[float, ...], side: float) -> Ar
 
 
 def _family(rig: Rig) -> int:
-    """Which of the dictionary's ten families of markers a rig's sheet has: sheets whose sizes differ
-    by `FAMILY_STEP` or more are not taken for each other's enlargement."""
+    """Which of the dictionary's ten families of markers a rig's sheet has: of sheets whose sizes
+    differ by `FAMILY_STEP` or more, one is not taken for the other's enlargement."""
     return math.floor(math.log(rig.sample_size) / math.log(FAMILY_STEP)) % 10
 
 
