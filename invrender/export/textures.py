@@ -151,10 +151,13 @@ def write_zip(folder: Path, out: Path) -> None:
 
 def safe_name(text: str) -> str:
     """A name for files and materials of any script's letters, digits, - and _: it cannot leave a
-    folder, and is none that Windows keeps for devices."""
-    name = re.sub(r"[^\w-]+", "_", unicodedata.normalize("NFC", text)).strip("_")[:64]
-    reserved = re.fullmatch(r"(?i)con|prn|aux|nul|com\d|lpt\d", name)
-    return f"{name}_" if reserved else name or "material"
+    folder, and is none that Windows keeps for devices. Where that changes the text, a checksum of
+    it follows, so that two names stay two."""
+    text = unicodedata.normalize("NFC", text)
+    name = re.sub(r"[^\w-]+", "_", text).strip("_")[:64] or "material"
+    if name == text and not re.fullmatch(r"(?i)con|prn|aux|nul|com\d|lpt\d", name):
+        return name
+    return f"{name}-{zlib.crc32(text.encode('utf-8', 'backslashreplace')):08x}"
 
 
 def _png16(codes: NDArray[np.uint16], colour: bool, width: float | None) -> bytes:
