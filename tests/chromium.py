@@ -7,6 +7,7 @@ import select
 import shutil
 import subprocess
 import tempfile
+import time
 from pathlib import Path
 
 CHROMIUM = next(
@@ -21,9 +22,10 @@ FLAGS = [
 
 class Page:
     """One page of a browser of its own. ``problems``: console errors, exceptions, failed loads,
-    and every request that is not for the page itself or data within it."""
+    and every request that is not for the page itself, data within it, or its ``site``."""
 
-    def __init__(self, width=1200, height=900):
+    def __init__(self, width=1200, height=900, site=None):
+        self.own = ("file:", "data:", "about:", "blob:", *([site] if site else []))
         self.profile = tempfile.TemporaryDirectory()
         read, self.to = os.pipe()
         self.source, write = os.pipe()
@@ -82,12 +84,14 @@ class Page:
             self.problems.append(params["entry"])
         elif method == "Network.requestWillBeSent":
             url = params["request"]["url"]
-            if not url.startswith(("file:", "data:", "about:")):
+            if not url.startswith(self.own):
                 self.problems.append(url)
 
     def open(self, path):
+        """Load a file, or an address."""
         self.loaded = False
-        self("Page.navigate", url=Path(path).resolve().as_uri())
+        url = str(path) if "://" in str(path) else Path(path).resolve().as_uri()
+        self("Page.navigate", url=url)
         while not self.loaded:
             self._receive()
 
@@ -99,6 +103,39 @@ class Page:
         if "exceptionDetails" in done:
             raise RuntimeError(str(done["exceptionDetails"]))
         return done["result"].get("value")
+
+    def until(self, expression, seconds=60):
+        """Wait until a JavaScript expression is true; returns its value."""
+        end = time.monotonic() + seconds
+        plain = f"(v => v instanceof Node ? true : v)({expression})"
+        while not (value := self.js(plain)):
+            assert time.monotonic() < end, f"{expression}: {self.js('document.body.innerText')}"
+            time.sleep(0.05)
+        return value
+
+    def click(self, selector, seconds=60):
+        """Click the middle of an element with the mouse, once it is there and enabled."""
+        element = f"document.querySelector({json.dumps(selector)})"
+        self.until(f"{element} && !{element}.disabled && {element}.offsetParent !== null", seconds)
+        x, y = self.js(
+            f"(() => {{ {element}.scrollIntoView({{ block: 'center', behavior: 'instant' }});"
+            f"const b = {element}.getBoundingClientRect();"
+            "return [b.left + b.width / 2, b.top + b.height / 2]; })()"
+        )
+        self.drag((x, y), (x, y))
+
+    def size(self, width, height, scale=1, dark=False):
+        """Make the window as large as a device's, in its light or dark colours."""
+        self("Emulation.setDeviceMetricsOverride", width=width, height=height,
+             deviceScaleFactor=scale, mobile=width < 600)  # fmt: skip
+        features = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
+        self("Emulation.setEmulatedMedia", features=features)
+
+    def choose_files(self, selector, files):
+        """Give files to an input, as a person who picks them does."""
+        root = self("DOM.getDocument")["root"]["nodeId"]
+        node = self("DOM.querySelector", nodeId=root, selector=selector)["nodeId"]
+        self("DOM.setFileInputFiles", nodeId=node, files=[str(f) for f in files])
 
     def drag(self, start, end, button="left"):
         """Press at one point of the window, move to another and let go."""

@@ -12,9 +12,9 @@ import os
 import sys
 from collections.abc import Sequence
 
-from invrender.cli import compare, doctor, export, inspect, pattern, refine, simulate
+from invrender.cli import app, compare, doctor, export, inspect, pattern, refine, simulate
 
-COMMANDS = (refine, simulate, pattern, inspect, compare, export, doctor)
+COMMANDS = (app, refine, simulate, pattern, inspect, compare, export, doctor)
 SHELLS = ("bash", "zsh", "tcsh")  # shtab's
 
 

@@ -40,30 +40,32 @@ def write_display_png(path: Path, pattern: Array, size: float, ppi: float) -> No
 
     The file states its resolution (pHYs). Raises `InputError` for impossible sizes.
     """
-    image = _encoded(pattern, device_pixels(size, ppi))
+    image = encoded(pattern, device_pixels(size, ppi))
     with atomic_path(path) as temporary:
         image.save(temporary, format="PNG", dpi=(ppi, ppi))
 
 
-def pattern_page(pattern: Array, size: float, ppi: float | None = None) -> str:
+def pattern_page(pattern: Array, size: float, ppi: float | None = None, script: str = "") -> str:
     """An HTML page that shows the pattern (h, w, 3), mirrored, ``size`` metres a side.
 
     It is one file and loads nothing: its content security policy allows the image inside it and
     its one script, by that script's hash. Without ``ppi``, the display's pixels an inch, its user
-    finds the scale with a bank card.
+    finds the scale with a bank card. ``script``: the address of one more script, for a page that a
+    server of its own keeps in step: it may ask that server, and nobody else.
     """
     if ppi is not None:
         device_pixels(size, ppi)
     out = io.BytesIO()
-    _encoded(pattern, PAGE_PIXELS).save(out, "PNG")
-    script = _data("page.js")
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    encoded(pattern, PAGE_PIXELS).save(out, "PNG")
+    own = _data("page.js")
+    digest = base64.b64encode(hashlib.sha256(own.encode()).digest()).decode()
     page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(
         _data("page.html.j2")
     )
     return page.render(
         css=_data("page.css"),
-        script=script,
+        script=own,
+        more=script,
         script_hash=f"sha256-{digest}",
         uri="data:image/png;base64," + base64.b64encode(out.getvalue()).decode(),
         mm=1000 * size,
@@ -71,7 +73,7 @@ def pattern_page(pattern: Array, size: float, ppi: float | None = None) -> str:
     )
 
 
-def _encoded(pattern: Array, pixels: int) -> Image.Image:
+def encoded(pattern: Array, pixels: int) -> Image.Image:
     data = linear_to_srgb(mirrored(resize_pattern(pattern, pixels)))
     return Image.fromarray((data * 255 + 0.5).astype(np.uint8))
 

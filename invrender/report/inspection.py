@@ -17,10 +17,11 @@ from invrender.lights import Lights
 from invrender.rig import Rig
 from invrender.sampling import resize_pattern
 from invrender.sphere import irradiance
-from invrender.types import InputError, Notice
+from invrender.types import Array, InputError, Notice
 
 SHOWN = 1600  # pixels, the longer side of the annotated picture
 BLURRED = 0.03  # of the ball's radius, the camera's blur from which it is told
+COLOURS = {"ball": "lime", "horizon": "yellow", "screen": "red", "sample": "deepskyblue"}
 WEAK = 0.1  # share of the sample's light that the pattern gives, likewise; designed for 0.2 or more
 
 
@@ -112,18 +113,24 @@ def annotate(photo: Photo, rig: Rig, ball: Ball) -> Image.Image:
     white = max(float(np.percentile(small, 99)), 1e-9)
     picture = Image.fromarray((linear_to_srgb(small / white) * 255 + 0.5).astype(np.uint8))
     draw = ImageDraw.Draw(picture)
-    size = (photo.height, photo.width)
-
-    def line(points: Any, colour: str) -> None:
-        pixels = rig.project(points, *size) / step
+    lines = outlines(rig, ball, photo.height, photo.width)
+    for name, colour in COLOURS.items():
+        pixels = lines[name] / step
         draw.line([(float(u), float(v)) for u, v in [*pixels, pixels[0]]], fill=colour, width=2)
-
-    centre = np.asarray(ball.position)
-    line(outline_points(rig, centre, ball.radius_m), "lime")
-    line(horizon_points(rig, centre, ball.radius_m), "yellow")
-    line(_screen_image(rig, ball), "red")
-    line(rig.sample_corners, "deepskyblue")
     return picture
+
+
+def outlines(rig: Rig, ball: Ball, height: int, width: int) -> dict[str, Array]:
+    """Closed lines (n, 2) in photo pixels: the ball's outline, its horizon, the screen in it and
+    the sample's border."""
+    centre = np.asarray(ball.position)
+    points = {
+        "ball": outline_points(rig, centre, ball.radius_m),
+        "horizon": horizon_points(rig, centre, ball.radius_m),
+        "screen": _screen_image(rig, ball),
+        "sample": rig.sample_corners,
+    }
+    return {name: rig.project(p, height, width) for name, p in points.items()}
 
 
 def _screen_image(rig: Rig, ball: Ball) -> Any:

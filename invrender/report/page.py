@@ -73,7 +73,7 @@ def report_html(
         spread = np.sqrt(np.mean(spread**2, -1)) if spread.ndim == 3 else spread
         shown.append({
             "name": name, "title": title, "text": text, "uri": _jpeg(image),
-            "sigma_uri": _jpeg(_heat(spread / SIGMA_TOP)), "median": float(np.median(spread)),
+            "sigma_uri": _jpeg(heat(spread / SIGMA_TOP)), "median": float(np.median(spread)),
         })  # fmt: skip
     sky = environment[: environment.shape[0] // 2]
     lights = [
@@ -122,25 +122,26 @@ def viewer_data(maps: Maps, environment: Array) -> dict[str, Any]:
     """
     encoded = maps.encoded()
     diffuse, specular, normal, roughness = (
-        _resized(encoded[k], VIEWER_SIZE) for k in ("diffuse", "specular", "normal", "roughness")
+        block_means(encoded[k], VIEWER_SIZE) for k in ("diffuse", "specular", "normal", "roughness")
     )
     size = max(diffuse.shape[:2])
     slopes = normal[..., :2] * 2 - 1
     words = np.concatenate([slopes * 32767 + 32768, roughness[..., None] * 65535], -1)
     words = np.clip(np.rint(words), 0, 65535).astype(np.uint16)
     textures = {
-        "diffuse": _bytes(linear_to_srgb(diffuse)), "specular": _bytes(linear_to_srgb(specular)),
+        "diffuse": to_bytes(linear_to_srgb(diffuse)),
+        "specular": to_bytes(linear_to_srgb(specular)),
         "high": (words >> 8).astype(np.uint8), "low": (words & 255).astype(np.uint8),
     }  # fmt: skip
     return {
         "size": size,
         "textures": {k: _uri(v, "PNG", compress_level=4) for k, v in textures.items()},
-        "room": _room(environment),
+        "room": room_data(environment),
         "shaders": {k: _data(f"{k}.glsl") for k in ("brdf", "filter", "shade")},
     }
 
 
-def _room(environment: Array) -> dict[str, Any] | None:
+def room_data(environment: Array) -> dict[str, Any] | None:
     """The room, scaled so that its irradiance on the table is π; None where it is dark."""
     level = float(irradiance(environment).mean()) / np.pi
     if not level > 0:
@@ -231,14 +232,14 @@ def _level(radiance: Array) -> float:
     return max(float(np.percentile(radiance, 98)), 1e-12)
 
 
-def _heat(x: Array) -> Array:
+def heat(x: Array) -> Array:
     """Values in [0, 1] as colours (..., 3)."""
     at = np.linspace(0, 1, len(INFERNO))
     table = np.array(INFERNO) / 255
     return np.stack([np.interp(x, at, table[:, c]) for c in range(3)], -1)
 
 
-def _resized(image: Array, largest: int) -> Array:
+def block_means(image: Array, largest: int) -> Array:
     """Mean over blocks, so that no side is longer than ``largest``."""
     step = -(-max(image.shape[:2]) // largest)
     if step == 1:
@@ -248,13 +249,13 @@ def _resized(image: Array, largest: int) -> Array:
     return np.asarray(blocks.mean((1, 3), dtype=np.float32))
 
 
-def _bytes(image: Array) -> NDArray[np.uint8]:
+def to_bytes(image: Array) -> NDArray[np.uint8]:
     return np.asarray(np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 def _jpeg(image: Array) -> str:
     """Display values (H, W) or (H, W, 3) in [0, 1] as a data URI."""
-    data = _bytes(_resized(image, PICTURE_SIZE))
+    data = to_bytes(block_means(image, PICTURE_SIZE))
     return _uri(data, "JPEG", quality=92, subsampling=0)
 
 

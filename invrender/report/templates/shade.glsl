@@ -1,5 +1,5 @@
 // One object, one point light, the captured room. Lengths in half sample sizes; x right, y up, z to
-// the viewer, as in the rig. SHAPE: plane, sphere, cylinder. SHOW: material, diffuse, specular,
+// the viewer, as in the rig. SHAPE: plane, sphere, cylinder, cloth. SHOW: material, diffuse, specular,
 // roughness, normal. LAMP, ROOM: 1 where there is such light.
 uniform sampler2D diffuse_map, specular_map, slopes_roughness;
 uniform sampler2D irradiance_map, blurred, reflectance_map;
@@ -38,6 +38,40 @@ bool trace(vec3 o, vec3 d, out Hit hit) {
   hit.tangent = across > 0.0 ? vec3(hit.n.z, 0, -hit.n.x) / across : vec3(1, 0, 0);
   hit.uv = vec2(atan(hit.n.x, hit.n.z) / PI + 0.5, acos(clamp(hit.n.y, -1.0, 1.0)) / PI);
   return s >= 0.0;
+}
+#elif SHAPE == 3
+// A cloth in folds: a height field over the square, found by steps and then by halving.
+float folds(vec2 p, out vec2 slope) {
+  vec2 a = vec2(3.1, 1.3), b = vec2(-1.9, 4.3), c = vec2(6.7, -5.2);
+  vec3 at = vec3(dot(a, p), dot(b, p) + 1.0, dot(c, p) + 2.0), s = sin(at), k = cos(at);
+  slope = 0.1 * k.x * a + 0.06 * k.y * b + 0.018 * k.z * c;
+  return 0.1 * s.x + 0.06 * s.y + 0.018 * s.z - 0.1;
+}
+bool trace(vec3 o, vec3 d, out Hit hit) {
+  const float TOP = 0.08, BOTTOM = -0.28;
+  const int STEPS = 14, HALVINGS = 6;
+  vec2 slope;
+  float near = (TOP - o.z) / d.z, far = (BOTTOM - o.z) / d.z;
+  float step_t = (far - near) / float(STEPS);
+  float low = near, high = far;
+  bool below = false;
+  for (int i = 1; i <= STEPS; i++) {
+    float t = near + step_t * float(i);
+    vec3 p = o + t * d;
+    if (p.z < folds(p.xy, slope)) { high = t; low = t - step_t; below = true; break; }
+  }
+  for (int i = 0; i < HALVINGS; i++) {
+    float t = 0.5 * (low + high);
+    vec3 p = o + t * d;
+    if (p.z < folds(p.xy, slope)) high = t; else low = t;
+  }
+  hit.t = high;
+  hit.p = o + high * d;
+  folds(hit.p.xy, slope);
+  hit.n = normalize(vec3(-slope, 1));
+  hit.tangent = normalize(vec3(1, 0, slope.x));
+  hit.uv = vec2(hit.p.x, -hit.p.y) * 0.5 + 0.5;
+  return below && d.z < 0.0 && near > 0.0 && max(abs(hit.p.x), abs(hit.p.y)) <= 1.0;
 }
 #else
 bool trace(vec3 o, vec3 d, out Hit hit) {

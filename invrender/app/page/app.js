@@ -1,0 +1,121 @@
+// The page: its state as the server tells it, and the step that the address names.
+import { h, api, toast, go } from "./ui.js";
+import { home } from "./home.js";
+import { rig } from "./rig.js";
+import { tablet } from "./tablet_step.js";
+import { photo } from "./photo.js";
+import { check } from "./check.js";
+import { maps } from "./maps.js";
+import { take } from "./take.js";
+
+const STEPS = ["Rig", "Tablet", "Photo", "Maps", "Take away"];
+export const state = { captures: [], profiles: [], profile: null };
+let view = null, shown = null;
+
+const saved = { get: (k) => { try { return localStorage.getItem("invrender." + k); } catch { return null; } },
+  set: (k, v) => { try { localStorage.setItem("invrender." + k, v); } catch { /* private window */ } } };
+
+export const captureOf = (id) => state.captures.find((c) => c.id === id);
+export function chosen() {
+  return state.profiles.find((p) => p.id === state.profile) || state.profiles[0];
+}
+export function choose(id) { state.profile = id; saved.set("profile", id); }
+
+function take_in(capture) {
+  const at = state.captures.findIndex((c) => c.id === capture.id);
+  if (at >= 0) state.captures[at] = capture;
+  else state.captures.unshift(capture);
+  state.captures.sort((a, b) => (a.id < b.id ? 1 : -1));
+}
+export { take_in as takeIn };
+
+function steps(now, id) {
+  const to = ["#/rig", "#/tablet", id ? `#/c/${id}` : "#/photo", id && `#/c/${id}/maps`, id && `#/c/${id}/files`];
+  const done = id && captureOf(id)?.report;
+  document.getElementById("steps").replaceChildren(now < 0 ? "" : h("ol", {}, STEPS.map((name, i) => {
+    const open = i < 3 || (i === 3 && id) || (i === 4 && done);
+    const inside = [h("i", { "aria-hidden": "true" }, String(i + 1)), h("b", {}, name)];
+    const item = open ? h("a", { href: to[i], "aria-current": i === now && "step", "aria-label": `${i + 1}. ${name}` }, inside)
+      : h("span.off", { "aria-hidden": "true" }, inside);
+    return h(i === now ? "li.now" : "li", {}, item);
+  })));
+}
+
+const ROUTES = [
+  [/^$/, home, -1, "Captures"], [/^rig$/, rig, 0, "Rig"], [/^tablet$/, tablet, 1, "Tablet"],
+  [/^photo$/, photo, 2, "Photo"], [/^c\/([\w-]+)$/, check, 2, "Photo"],
+  [/^c\/([\w-]+)\/maps$/, maps, 3, "Maps"], [/^c\/([\w-]+)\/files$/, take, 4, "Take away"],
+];
+
+function route() {
+  const at = location.hash.replace(/^#\/?/, "");
+  if (at === "main") return;
+  for (const [pattern, make, step, title] of ROUTES) {
+    const match = at.match(pattern);
+    if (!match) continue;
+    if (match[1] && !captureOf(match[1])) break;
+    view?.end?.();
+    const main = document.getElementById("main");
+    main.replaceChildren();
+    shown = { step, id: match[1] };
+    steps(step, match[1]);
+    document.title = `${title} · invrender`;
+    view = make(main, match[1]) || {};
+    scrollTo(0, 0);
+    main.focus({ preventScroll: true });
+    return;
+  }
+  go("#/");
+}
+
+function update(id) {
+  if (!shown) return;
+  steps(shown.step, shown.id);
+  if (!id || !shown.id || id === shown.id) view?.update?.(id);
+}
+
+function listen() {
+  const events = new EventSource("/api/events");
+  const offline = document.getElementById("offline");
+  const on = (kind, act) => events.addEventListener(kind, (e) => act(JSON.parse(e.data)));
+  on("state", (all) => {
+    const first = !shown;
+    Object.assign(state, all);
+    offline.hidden = true;
+    document.documentElement.dataset.connected = "yes";
+    if (first) route(); else if (shown.id && !captureOf(shown.id)) go("#/"); else update();
+  });
+  on("capture", (capture) => { take_in(capture); update(capture.id); });
+  on("gone", (id) => {
+    state.captures = state.captures.filter((c) => c.id !== id);
+    if (shown?.id === id) go("#/"); else update();
+  });
+  on("profiles", (profiles) => { state.profiles = profiles; update(); });
+  on("shown", (what) => { state.shown = what; update(); });
+  events.onerror = () => {
+    document.documentElement.dataset.connected = "no";
+    offline.hidden = false;
+    if (events.readyState === EventSource.CLOSED) {
+      setTimeout(async () => {
+        const answer = await fetch("/api/state").catch(() => null);
+        if (answer?.status === 401) { location.reload(); return; }
+        listen();
+      }, 1000);
+    }
+  };
+}
+
+state.profile = saved.get("profile");
+addEventListener("hashchange", route);
+addEventListener("error", (e) => toast(`A fault of this page: ${e.message}`));
+listen();
+
+export async function discard(capture) {
+  await api(`/api/captures/${capture.id}`, "DELETE");
+  toast(`“${capture.name}” is in the trash.`, () => api(`/api/captures/${capture.id}/restore`, "POST"), "Bring it back");
+}
+export async function example() {
+  const made = await api("/api/captures?example=1", "POST");
+  take_in(made);
+  go(`#/c/${made.id}`);
+}

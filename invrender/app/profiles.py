@@ -1,0 +1,163 @@
+"""Rigs that a person keeps by name, in millimetres, as the app's first step asks for them."""
+
+from __future__ import annotations
+
+import json
+import re
+import secrets
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from invrender.files.write import atomic_path
+from invrender.rig import BALL_SHAPES, Rig
+from invrender.types import InputError
+
+LONGEST_NAME = 80  # characters
+MOST_PROFILES = 100
+PHOTO_COUNTS = (1, 5)  # the default pattern alone, or with the four halves
+
+
+class Tablet(NamedTuple):
+    """A display: its long and short side in pixels, and pixels an inch, as its maker states."""
+
+    name: str
+    long: int
+    short: int
+    ppi: float
+
+
+# By the makers' data sheets.
+TABLETS = (
+    Tablet("iPad Pro 13″ (M4)", 2752, 2064, 264),
+    Tablet("iPad Pro 12.9″, iPad Air 13″", 2732, 2048, 264),
+    Tablet("iPad Pro 11″ (M4)", 2420, 1668, 264),
+    Tablet("iPad Pro 11″ (2018–2022)", 2388, 1668, 264),
+    Tablet("iPad Air 11″, iPad 10.9″", 2360, 1640, 264),
+    Tablet("iPad 10.2″", 2160, 1620, 264),
+    Tablet("iPad mini 8.3″", 2266, 1488, 326),
+    Tablet("Galaxy Tab S8, S9 11″", 2560, 1600, 274),
+    Tablet("Galaxy Tab S8+, S9+ 12.4″", 2800, 1752, 266),
+    Tablet("Galaxy Tab S8, S9 Ultra 14.6″", 2960, 1848, 239),
+    Tablet("Galaxy Tab A9+ 11″", 1920, 1200, 206),
+    Tablet("Pixel Tablet 11″", 2560, 1600, 276),
+    Tablet("Xiaomi Pad 6 11″", 2880, 1800, 309),
+    Tablet("OnePlus Pad 11.6″", 2800, 2000, 296),
+    Tablet("Surface Pro 8, 9 13″", 2880, 1920, 267),
+    Tablet("Surface Go 10.5″", 1920, 1280, 220),
+    Tablet("Fire HD 10 10.1″", 1920, 1200, 224),
+)
+
+
+@dataclass(frozen=True)
+class Profile:
+    """A rig by name. Lengths in millimetres: the pattern's ``side``, its ``height`` above the
+    table, the ``gap`` from its edge to the middle of the lens, the ball's diameter. ``shape``: of
+    the ball, or "" to find it in the photo. ``ppi``: of the display, or None if its page asks.
+    ``photos``: how many a capture has. Raises `InputError` for what no rig is."""
+
+    name: str = "My tablet"
+    tablet: str = ""
+    ppi: float | None = None
+    side: float = 180.0
+    height: float = 153.0
+    gap: float = 34.0
+    ball: float = 19.0
+    shape: str = ""
+    photos: int = 1
+    id: str = ""
+
+    def __post_init__(self) -> None:
+        for field in ("side", "height", "gap", "ball"):
+            value = getattr(self, field)
+            if not isinstance(value, int | float) or isinstance(value, bool):
+                raise InputError(f"the rig's {field} must be a number of millimetres")
+        for field in ("name", "tablet"):
+            if not isinstance(getattr(self, field), str):
+                raise InputError(f"the rig's {field} must be text")
+        if not self.name.strip() or len(self.name) > LONGEST_NAME:
+            raise InputError(f"give the rig a name of at most {LONGEST_NAME} characters")
+        if self.shape not in ("", *BALL_SHAPES):
+            raise InputError("the ball is a hemisphere, a sphere, or not stated")
+        if self.ppi is not None and (
+            isinstance(self.ppi, bool)
+            or not isinstance(self.ppi, int | float)
+            or not 30 <= self.ppi <= 2000
+        ):
+            raise InputError("a display has 30 to 2000 pixels an inch")
+        if self.photos not in PHOTO_COUNTS:
+            raise InputError(f"a capture has {' or '.join(map(str, PHOTO_COUNTS))} photos")
+        if not 1 <= self.side <= 5000:
+            raise InputError("the pattern's side is 1 to 5000 mm")
+        self.rig()
+
+    def rig(self) -> Rig:
+        """The rig in metres."""
+        return Rig(
+            screen_size=self.side / 1000,
+            screen_height=self.height / 1000,
+            camera_offset=self.gap / 2000,
+            ball_radius=self.ball / 2000,
+            ball_shape=self.shape or Rig.ball_shape,
+        )
+
+    def rig_toml(self) -> str:
+        """``rig.toml``: field of view, reflectance and an unknown shape are left to the photo."""
+        rig = self.rig()
+        shape = f'shape = "{self.shape}"\n' if self.shape else ""
+        return (
+            f"[screen]\nsize = {rig.screen_size!r}\nheight = {rig.screen_height!r}\n"
+            f"[camera]\noffset = {rig.camera_offset!r}\n"
+            f"[ball]\nradius = {rig.ball_radius!r}\n{shape}"
+            '[pattern]\nimage = "pattern.exr"\n'
+        )
+
+
+def profile_of(values: Any, id: str = "") -> Profile:
+    """A profile from JSON. Raises `InputError`."""
+    known = {f.name for f in fields(Profile)} - {"id"}
+    if not isinstance(values, dict) or not values.keys() <= known | {"id"}:
+        raise InputError(f"a rig has {', '.join(sorted(known))}, and nothing else")
+    try:
+        return Profile(**{**values, "id": id})
+    except TypeError as error:
+        raise InputError(f"this is no rig: {error}") from None
+
+
+def read_profiles(file: Path) -> list[Profile]:
+    """The profiles of a file, what cannot be read left out; the default rig where there is none."""
+    found = []
+    try:
+        entries = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        entries = []
+    for entry in entries if isinstance(entries, list) else []:
+        id = entry.get("id", "") if isinstance(entry, dict) else ""
+        if isinstance(id, str) and re.fullmatch(r"[0-9a-f]{8}", id):
+            try:
+                found.append(profile_of(entry, id))
+            except InputError:
+                continue
+    return found or [Profile(name="Default rig", id="00000000")]
+
+
+def save_profile(file: Path, profile: Profile) -> Profile:
+    """Add a profile, or replace the one with its id; returns it with an id."""
+    profiles = read_profiles(file)
+    if not profile.id:
+        profile = replace(profile, id=secrets.token_hex(4))
+        if len(profiles) >= MOST_PROFILES:
+            raise InputError(f"there are {MOST_PROFILES} rigs already: delete one first")
+    kept = [p for p in profiles if p.id != profile.id]
+    _write(file, [profile, *kept])
+    return profile
+
+
+def delete_profile(file: Path, id: str) -> None:
+    """Forget a profile."""
+    _write(file, [p for p in read_profiles(file) if p.id != id])
+
+
+def _write(file: Path, profiles: list[Profile]) -> None:
+    with atomic_path(file) as path:
+        path.write_text(json.dumps([asdict(p) for p in profiles], indent=1), encoding="utf-8")
