@@ -20,6 +20,7 @@ from lazy_loader import attach
 if TYPE_CHECKING:
     from invrender.capture.lights import find_lights
     from invrender.data.simulate import simulate
+    from invrender.device import Device
     from invrender.files.capture import Capture, load_capture
     from invrender.lights import Lights
     from invrender.maps import Estimate, Maps
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Capture",
+    "Device",
     "Estimate",
     "InputError",
     "Lights",
@@ -52,6 +54,7 @@ __getattr__, __dir__, _ = attach(
     {
         "capture.lights": ["find_lights"],
         "data.simulate": ["simulate"],
+        "device": ["Device"],
         "files.capture": ["Capture", "load_capture"],
         "lights": ["Lights"],
         "maps": ["Estimate", "Maps"],

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from invrender.device import Device
 from invrender.rig import Rig
 from invrender.sphere import rotate_environment
 from invrender.types import Array
@@ -18,8 +19,9 @@ class Lights:
     """The screen's light and the room's, in one unit of radiance (a photo's, where one shows them).
 
     rig: where screen and camera are. The screen's radiance is ``gain`` (a number or RGB) times
-    ``pattern`` (P, P, 3), relative radiance as the display shows it, row 0 at +y. environment:
-    linear RGB radiance (H, 2H, 3), row 0 at the zenith; zeros, as by default, for a dark room.
+    what ``device`` makes of ``pattern`` (h, w, 3), linear values in [0, 1], row 0 at +y: ``shown``
+    straight ahead, less towards the sides. environment: linear RGB radiance (H, 2H, 3), row 0 at
+    the zenith; zeros, as by default, for a dark room.
 
     What `invrender.find_lights` adds of a photo's mirror ball. coverage: (H, 2H), the share of each
     texel of the environment that the ball really shows, the rest is filled in. pattern_captured:
@@ -45,6 +47,12 @@ class Lights:
     coverage: Array | None = None
     pattern_captured: Array | None = None
     fit: dict[str, float] = field(default_factory=dict)
+    device: Device = Device()
+
+    @property
+    def shown(self) -> Array:
+        """Relative radiance (h, w, 3) straight ahead of the screen: the pattern as displayed."""
+        return self.device.shown(self.pattern)
 
     def turned(self, quarters: int) -> Lights:
         """Seen from a sample that is turned clockwise: all turned counter-clockwise by quarters

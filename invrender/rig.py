@@ -1,9 +1,11 @@
 """The rig: tablet, camera and mirror ball above a flat sample, and all of its geometry.
 
 Right-handed metres, origin at the sample's centre, z up, x towards the camera and the ball.
-The sample fills x, y in [-l/4, l/4]; the l × l screen hangs at height h, shifted to the sample's
-mirror image as the camera sees it; the camera sits at (l/4 + delta, 0, h) and looks straight down
-on the ball, which stands at (l/4 + delta, 0, 0). Nothing else in the package repeats these numbers.
+The sample fills x, y in [-a, a]; the camera sits at (a + delta, 0, H) and looks straight down on
+the ball, which stands at (a + delta, 0, 0). The w × d screen hangs at height h, its edge 2·delta
+from the optical axis: x in [a - delta - w, a - delta], y in [-d/2, d/2]. A square of side l has
+a = l/4 and is the sample's mirror image as the camera sees it (H = h). Nothing else in the package
+repeats these numbers.
 """
 
 from __future__ import annotations
@@ -16,28 +18,30 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from invrender.types import Array, InputError
+from invrender.types import Array, InputError, Vec3
 
-Vec3 = tuple[float, float, float]
 LONGEST = 1e6  # of any length, in whatever unit
 BALL_SHAPES = ("hemisphere", "sphere")
-_LENGTHS = ("_size", "_height", "_offset", "_radius", "_shift")
+_LENGTHS = ("_size", "_side", "_height", "_offset", "_radius", "_shift", "_bezel")
 
 
 @dataclass(frozen=True)
 class Rig:
     """Sizes in metres, angles in degrees. The defaults are a tablet and a 19 mm ball.
 
-    ``ball_shape``: a "hemisphere" has its flat side on the table, a "sphere" stands on the table.
+    ``screen_size``: of the lit area, a square's side or (along x, along y). ``sample_side``: of the
+    square sample, by default half of the screen's shorter side. ``screen_bezel``: width of the
+    black border around the lit area, which hides what is behind. ``camera_height``: by default the
+    screen's. ``ball_shape``: a "hemisphere" has its flat side on the table, a "sphere" stands on it.
     ``screen_shift`` and ``screen_tilt`` (a rotation vector about the screen's centre), and the
     same for the camera, say how a hand-held rig differs from the nominal one. Raises `InputError`
     for sizes that no rig has.
 
-        rig = Rig(screen_size=0.197, screen_height=0.16, camera_offset=0.02)
+        rig = Rig(screen_size=(0.228, 0.16), screen_height=0.16, camera_offset=0.02)
         print(rig.sample_size)
     """
 
-    screen_size: float = 0.18
+    screen_size: float | tuple[float, float] = 0.18
     screen_height: float = 0.153
     camera_offset: float = 0.017
     ball_radius: float = 0.0095
@@ -48,26 +52,35 @@ class Rig:
     screen_tilt: Vec3 = (0.0, 0.0, 0.0)
     camera_shift: Vec3 = (0.0, 0.0, 0.0)
     camera_tilt: Vec3 = (0.0, 0.0, 0.0)
+    screen_bezel: float = 0.0
+    camera_height: float | None = None
+    sample_side: float | None = None
 
     def __post_init__(self) -> None:
         if self.ball_shape not in BALL_SHAPES:
             raise InputError(f"rig: ball shape must be one of {', '.join(BALL_SHAPES)}")
-        for f in fields(self):
-            if f.name != "ball_shape" and not np.all(np.isfinite(getattr(self, f.name))):
-                raise InputError(f"rig: {f.name} must be finite")
-        for name in ("screen_size", "ball_radius"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"rig: {name} must be positive, got {getattr(self, name):g}")
+        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "ball_shape"}
+        values = {name: value for name, value in values.items() if value is not None}
+        for name, value in values.items():
+            if not np.all(np.isfinite(value)):
+                raise InputError(f"rig: {name} must be finite")
+        if np.shape(self.screen_size) not in ((), (2,)):
+            raise InputError("rig: screen_size must be one number or two")
+        for name in ("screen_size", "ball_radius", "sample_side", "camera_height"):
+            least = float(np.min(values.get(name, 1.0)))
+            if not least > 0:
+                raise InputError(f"rig: {name} must be positive, got {least:g}")
+        if not self.screen_bezel >= 0:
+            raise InputError(f"rig: screen_bezel must not be negative, got {self.screen_bezel:g}")
         if not self.screen_height > 0:
             raise InputError(
                 f"rig: the screen must be above the table, got a height of {self.screen_height:g}"
             )
         if not self.camera_offset >= 0:
             raise InputError(f"rig: camera offset must not be negative, got {self.camera_offset:g}")
-        lengths = [getattr(self, f.name) for f in fields(self) if f.name.endswith(_LENGTHS)]
-        if any(np.abs(v).max() > LONGEST for v in lengths) or (
-            min(self.screen_size, self.screen_height, self.ball_radius) < 1 / LONGEST
-        ):
+        lengths = [value for name, value in values.items() if name.endswith(_LENGTHS)]
+        shortest = min(*self.screen_sides, self.screen_height, self.ball_radius, self.sample_size)
+        if any(np.abs(v).max() > LONGEST for v in lengths) or shortest < 1 / LONGEST:
             raise InputError(
                 f"rig: lengths must lie between {1 / LONGEST:g} and {LONGEST:g}; use metres"
             )
@@ -79,22 +92,16 @@ class Rig:
             raise InputError(f"rig: fov must be between 1 and 170 degrees, got {self.fov:g}")
         if not all(0 < r <= 1 for r in self.ball_reflectance):
             raise InputError("rig: ball reflectance must be above 0 and at most 1")
-        if self.screen_corner[2] <= 0 or any(
-            c[2] <= 0
-            for c in (
-                self.screen_corner + a + b
-                for a in (0, self.screen_edges[0])
-                for b in (0, self.screen_edges[1])
-            )
-        ):
+        corner, (e_x, e_y) = self.screen_body
+        if corner[2] + min(e_x[2], 0) + min(e_y[2], 0) <= 0:
             raise InputError("rig: the tilted screen reaches below the table")
 
     # --- the sample -----------------------------------------------------------------------------
 
     @property
     def sample_size(self) -> float:
-        """Side of the square sample, l/2."""
-        return self.screen_size / 2
+        """Side of the square sample, 2·a."""
+        return min(self.screen_sides) / 2 if self.sample_side is None else self.sample_side
 
     @property
     def sample_corners(self) -> Array:
@@ -113,36 +120,49 @@ class Rig:
 
     # --- the screen -----------------------------------------------------------------------------
 
+    @property
+    def screen_sides(self) -> tuple[float, float]:
+        """Width (along x) and depth (along y) of the screen's lit area."""
+        size = self.screen_size
+        return (size, size) if isinstance(size, (int, float)) else (size[0], size[1])
+
     @cached_property
     def screen_edges(self) -> tuple[Array, Array]:
-        """The screen's sides as vectors, along +x and along +y where it is not tilted."""
+        """The lit area's sides as vectors, along +x and along +y where it is not tilted."""
         turn = Rotation.from_rotvec(self.screen_tilt, degrees=True)
-        return (
-            turn.apply([self.screen_size, 0.0, 0.0]),
-            turn.apply([0.0, self.screen_size, 0.0]),
-        )
+        width, depth = self.screen_sides
+        return turn.apply([width, 0.0, 0.0]), turn.apply([0.0, depth, 0.0])
 
     @cached_property
     def screen_corner(self) -> Array:
-        """The screen's corner at -x, -y: point (s, t) of the screen is corner + s·e_x + t·e_y."""
-        centre = np.array(
-            [-self.screen_size / 4 - self.camera_offset, 0.0, self.screen_height]
-        ) + np.asarray(self.screen_shift)
+        """The lit area's corner at -x, -y: its point (s, t) is corner + s·e_x + t·e_y."""
+        near = self.sample_size / 2 - self.camera_offset
+        centre = np.array([near - self.screen_sides[0] / 2, 0.0, self.screen_height])
+        centre = centre + np.asarray(self.screen_shift)
         e_x, e_y = self.screen_edges
         return centre - e_x / 2 - e_y / 2
+
+    @cached_property
+    def screen_body(self) -> tuple[Array, tuple[Array, Array]]:
+        """Corner and sides of what hides the room: the lit area with its bezel."""
+        e_x, e_y = self.screen_edges
+        width, depth = self.screen_sides
+        b_x, b_y = e_x * (self.screen_bezel / width), e_y * (self.screen_bezel / depth)
+        return self.screen_corner - b_x - b_y, (e_x + 2 * b_x, e_y + 2 * b_y)
 
     # --- the camera -----------------------------------------------------------------------------
 
     @property
     def optical_axis_x(self) -> float:
-        """x of the ball and of the nominal camera, l/4 + delta."""
-        return self.screen_size / 4 + self.camera_offset
+        """x of the ball and of the nominal camera, a + delta."""
+        return self.sample_size / 2 + self.camera_offset
 
-    def screen_cosines(self, points: Array, cells: int) -> Array:
+    def screen_cosines(self, points: Array, cells: int, falloff: float = 0.0) -> Array:
         """∫ cos θ cos θ' / d² over each of the screen's ``cells`` × ``cells`` parts, by its middle.
 
         From ``points`` (..., 3) that face up, below the screen's front; (..., cells, cells), row 0
-        at the pattern's top. Times a pattern's radiance and summed it is the irradiance.
+        at the pattern's top. Times a pattern's radiance and summed it is the irradiance. falloff:
+        the display's (`invrender.device.Device`), times cos(θ')^falloff.
         """
         e_x, e_y = self.screen_edges
         t = (np.arange(cells) + 0.5) / cells
@@ -152,13 +172,17 @@ class Rig:
         p = np.asarray(points)
         square = (p * p).sum(-1)[..., None] + (middle * middle).sum(-1) - 2 * p @ middle.T
         cosines = np.maximum(middle[:, 2] - p[..., 2:], 0)
-        cosines *= np.maximum((p @ down)[..., None] - middle @ down, 0)
+        ahead = np.maximum((p @ down)[..., None] - middle @ down, 0)
+        cosines *= ahead
+        if falloff:
+            cosines *= (ahead / (np.linalg.norm(down) * np.sqrt(square))) ** falloff
         return np.asarray(cosines / square**2).reshape(*p.shape[:-1], cells, cells)
 
     @property
     def camera(self) -> Array:
         """Position of the pinhole, (3,)."""
-        nominal = np.array([self.optical_axis_x, 0.0, self.screen_height])
+        height = self.screen_height if self.camera_height is None else self.camera_height
+        nominal = np.array([self.optical_axis_x, 0.0, height])
         return nominal + np.asarray(self.camera_shift)
 
     @cached_property

@@ -8,10 +8,12 @@ the screen; they are smooth and noiseless, so a coarse grid over the sample serv
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 
+from invrender.device import Device
 from invrender.render.backend import Float, dr, vector
 from invrender.render.fast.estimator import Fast
 from invrender.render.scene import Scene, make_scene, make_view
@@ -91,11 +93,14 @@ def light_inputs(
     captured: Array | None = None,
     size: int = CLUE_SIZE,
     samples: int = CLUE_SAMPLES,
+    device: Device | None = None,
 ) -> dict[str, Array]:
     """The network's inputs that describe the light, as float32 arrays without a batch axis.
 
-    pattern (P, P, 3) relative radiance, gain RGB; environment (H, 2H, 3) radiance or None;
-    ``captured``: the screen's radiance as the ball shows it, if that is known. Returns, channels
+    pattern (h, w, 3) as in `Lights`, shown by ``device`` (None: an ideal one) with gain RGB;
+    environment (H, 2H, 3) radiance or None; ``captured``: the screen's radiance as the ball shows
+    it, if that is known. Of the display's dimming to the sides the prefiltered screen knows
+    nothing, the clues do. Returns, channels
     first: env_clues (12, h, h) with the screen a black occluder, active_clues (12, h, h),
     slope_clues (18, h, h) of both lights together,
     sky (9, ·, ·), screen (6, ·, ·), ball (3, ·, ·), pattern (3, ·, ·), rig (12,).
@@ -103,8 +108,9 @@ def light_inputs(
     gain = np.broadcast_to(np.asarray(gain, np.float32), 3)
     if not (np.any(pattern > 0) and np.any(gain > 0)):
         pattern, gain = np.ones((16, 16, 3), np.float32), np.zeros(3, np.float32)
-    lit = pattern * gain
-    active, slopes = plane_clues(make_scene(rig, pattern, None, gain), size, samples)
+    lit = (pattern if device is None else device.shown(pattern)) * gain
+    scene = make_scene(rig, pattern, None, gain, device=device)
+    active, slopes = plane_clues(scene, size, samples)
     out = {
         "active_clues": active,
         "screen": _levels(prefilter_screen(lit, CLUE_RHO, _relative_height(rig))),
@@ -137,7 +143,7 @@ def _levels(stack: Array) -> Array:
 
 def _relative_height(rig: Rig) -> float:
     centre = rig.screen_corner + sum(rig.screen_edges) / 2
-    return float(centre[2] / rig.screen_size)
+    return float(centre[2] / math.sqrt(math.prod(rig.screen_sides)))
 
 
 def white_level(lights: dict[str, Array], environment: bool = True) -> float:

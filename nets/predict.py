@@ -17,7 +17,7 @@ from invrender.refine.lobes import fit_lobes, read_lobes
 from invrender.refine.theta import to_theta
 from invrender.render.fast.estimator import Fast
 from invrender.render.renderer import Renderer
-from invrender.render.scene import make_scene
+from invrender.render.scene import scene_under
 from invrender.sampling import resize
 from invrender.types import Array, InputError
 from nets.batch import Batch, batch_of, lobe_input, positions
@@ -61,12 +61,13 @@ class Reconstructor:
             raise InputError(f"the photo must be (H, W, 3), got {photo.shape}")
         report = progress or (lambda share: None)
         report(0.0)
-        rig, pattern, room = lights.rig, lights.pattern, lights.environment
-        inputs = light_inputs(rig, pattern, lights.gain, room, lights.pattern_captured)
+        inputs = light_inputs(
+            lights.rig, lights.pattern, lights.gain, lights.environment, lights.pattern_captured,
+            device=lights.device,
+        )  # fmt: skip
         unit = white_level(inputs)
         scale = 1 / max(unit, LEAST_LEVEL)
-        scene = make_scene(rig, pattern, room, np.asarray(lights.gain) * scale, scale)
-        renderer = Fast(scene)
+        renderer = Fast(scene_under(lights, scale))
         report(LIGHTS_SHARE)
 
         def maps_of(photo: Array, report: Callable[[float], None]) -> Prediction:

@@ -53,12 +53,12 @@ def mask_environment(environment: Array, rig: Rig) -> Array:
     the table."""
     d = directions(*environment.shape[:2]).astype(np.float64)
     hidden = d[..., 2] <= 0
-    e_x, e_y = rig.screen_edges
+    corner, (e_x, e_y) = rig.screen_body
     m = np.cross(e_x, e_y)
     half = rig.sample_size / 2
     cos = d @ m
     for x, y in ((0, 0), (-1, -1), (1, -1), (-1, 1), (1, 1)):
-        offset = rig.screen_corner - np.array([x * half, y * half, 0])
+        offset = corner - np.array([x * half, y * half, 0])
         with np.errstate(divide="ignore", invalid="ignore"):
             p = d * (offset @ m / cos)[..., None] - offset
         s, t = p @ e_x / (e_x @ e_x), p @ e_y / (e_y @ e_y)

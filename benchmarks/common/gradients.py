@@ -19,7 +19,7 @@ from invrender.rig import Rig
 
 def sample_sensor(n: int, rig: Rig = RIG) -> mi.Sensor:
     """The rig's camera, cropped to the sample, with one pixel a texel of it, n × n."""
-    size = rig.screen_size
+    size, _ = rig.screen_sides
     return mi.load_dict(
         {
             "type": "perspective",

@@ -227,8 +227,9 @@ class _Fit:
         """The screen's sides and corner as `moved` has them, (..., 3) each."""
         tilt = np.asarray(u[..., _TILT] * SCREEN_FIT.tilt_deviation + self.rig.screen_tilt)
         turn = Rotation.from_rotvec(tilt.reshape(-1, 3), degrees=True).as_matrix()
-        sides = self.rig.screen_size * turn.reshape(*tilt.shape, 3)
-        e_x, e_y = sides[..., 0], sides[..., 1]
+        width, depth = self.rig.screen_sides
+        turn = turn.reshape(*tilt.shape, 3)
+        e_x, e_y = width * turn[..., 0], depth * turn[..., 1]
         level = sum(self.rig.screen_edges) / 2 + self.rig.screen_corner
         middle = level + u[..., _SHIFT] * SCREEN_FIT.shift_deviation * self.rig.sample_size
         return e_x, e_y, middle - (e_x + e_y) / 2

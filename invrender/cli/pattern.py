@@ -105,11 +105,11 @@ def run(args: argparse.Namespace, console: Console) -> int:
     else:
         pattern = default_pattern()
     if suffix == ".html":
-        page = pattern_page(pattern, rig.screen_size, args.ppi)
+        page = pattern_page(pattern, max(rig.screen_sides), args.ppi)
         with atomic_path(args.out) as path:
             path.write_text(page, encoding="utf-8")
     elif real:
-        write_display_png(args.out, pattern, rig.screen_size, args.ppi)
+        write_display_png(args.out, pattern, max(rig.screen_sides), args.ppi)
     else:
         image = resize_pattern(pattern, size)
         image = mirrored(image) if args.mirrored else image

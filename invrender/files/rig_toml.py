@@ -1,4 +1,4 @@
-"""`rig.toml`: the rig of a capture folder, read and written."""
+"""`rig.toml`: the rig of a capture folder and what is known of its display, read and written."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from invrender.device import Device
 from invrender.files.write import atomic_path
-from invrender.rig import BALL_SHAPES, Rig, Vec3
-from invrender.types import InputError, Notice
+from invrender.rig import BALL_SHAPES, Rig
+from invrender.types import InputError, Notice, Vec3
 
 # Section and key of rig.toml for each field of Rig.
 _KEYS: dict[tuple[str, str], str] = {
@@ -18,14 +19,19 @@ _KEYS: dict[tuple[str, str], str] = {
     ("screen", "height"): "screen_height",
     ("screen", "shift"): "screen_shift",
     ("screen", "tilt"): "screen_tilt",
+    ("screen", "bezel"): "screen_bezel",
     ("camera", "offset"): "camera_offset",
     ("camera", "fov"): "fov",
     ("camera", "shift"): "camera_shift",
     ("camera", "tilt"): "camera_tilt",
+    ("camera", "height"): "camera_height",
     ("ball", "radius"): "ball_radius",
     ("ball", "reflectance"): "ball_reflectance",
     ("ball", "shape"): "ball_shape",
+    ("sample", "size"): "sample_side",
 }
+# Keys of the section [device], by which a display that was measured is told.
+_DEVICE = tuple(f.name for f in fields(Device))
 # Fields of the rig that are measured in the photo where the file does not state them.
 FOUND_IN_PHOTO = frozenset({"ball_reflectance", "ball_shape"})
 _FILES = {("pattern", "image"), ("sample", "maps")}
@@ -41,7 +47,8 @@ class RigFile:
 
     files: the names of the pattern and of the sample's true maps, where given. fov_from: where the
     field of view is known from, "rig" (this file), "exif" or "unknown" (`Rig`'s default stands in).
-    warnings: what is doubtful about the numbers. unknown: of "ball_reflectance" and "ball_shape"
+    warnings: what is doubtful about the numbers. device: the display, where the file tells it.
+    unknown: of "ball_reflectance" and "ball_shape"
     what the file does not give, so that it is found in the photo.
     """
 
@@ -50,6 +57,7 @@ class RigFile:
     fov_from: str = "rig"
     warnings: tuple[Notice, ...] = ()
     unknown: frozenset[str] = frozenset()
+    device: Device | None = None
 
 
 def read_rig(path: Path, *, fov: float | None = None) -> RigFile:
@@ -61,6 +69,7 @@ def read_rig(path: Path, *, fov: float | None = None) -> RigFile:
 
     values: dict[str, Any] = {}
     files: dict[str, str] = {}
+    device: dict[str, Any] = {}
     for section, entries in table.items():
         if not isinstance(entries, dict):
             raise InputError(f"{path}: {section!r} must be a [section]")
@@ -69,16 +78,25 @@ def read_rig(path: Path, *, fov: float | None = None) -> RigFile:
                 if not isinstance(value, str) or not value:
                     raise InputError(f"{path}: [{section}] {key} must be a file name")
                 files[section] = value
+            elif section == "device" and key in _DEVICE:
+                device[key] = _device_value(path, key, value)
             elif (section, key) in _KEYS:
                 name, what = _KEYS[section, key], f"[{section}] {key}"
                 if name == "ball_shape":
                     if value not in BALL_SHAPES:
                         raise InputError(f"{path}: {what} must be one of {', '.join(BALL_SHAPES)}")
                     values[name] = value
+                elif name == "screen_size" and isinstance(value, list):
+                    if len(value) != 2 or not all(map(_is_real, value)):
+                        raise InputError(f"{path}: {what} must be a number or [width, depth]")
+                    values[name] = (float(value[0]), float(value[1]))
                 else:
                     values[name] = _number(path, what, value, name in _VECTORS)
             else:
-                known = sorted({k for s, k in [*_KEYS, *_FILES] if s == section})
+                known = sorted(
+                    {k for s, k in [*_KEYS, *_FILES, *(("device", d) for d in _DEVICE)]
+                     if s == section}
+                )  # fmt: skip
                 hint = f"known keys: {', '.join(known)}" if known else "no such section"
                 raise InputError(f"{path}: unknown key {key!r} in section {section!r} ({hint})")
     for section, key in _REQUIRED:
@@ -89,15 +107,19 @@ def read_rig(path: Path, *, fov: float | None = None) -> RigFile:
         values["fov"] = fov
     rig = Rig(**values)
     warnings: tuple[Notice, ...] = ()
-    if rig.screen_size > LARGEST_SCREEN:
+    width = max(rig.screen_sides)
+    if width > LARGEST_SCREEN:
         warnings = (
             Notice(
                 "rig-units",
-                f"rig.toml makes the screen {rig.screen_size:g} m wide; its lengths are metres: if "
+                f"rig.toml makes the screen {width:g} m wide; its lengths are metres: if "
                 "these are millimetres, divide them by 1000",
             ),
         )
-    return RigFile(rig, files, fov_from, warnings, FOUND_IN_PHOTO - values.keys())
+    known_display = Device(**device) if device else None
+    return RigFile(
+        rig, files, fov_from, warnings, FOUND_IN_PHOTO - values.keys(), known_display
+    )  # fmt: skip
 
 
 def _table(path: Path) -> dict[str, Any]:
@@ -125,28 +147,42 @@ def _table(path: Path) -> dict[str, Any]:
         raise InputError(f"{path} is not valid TOML: {e}") from None
 
 
-def _number(path: Path, what: str, value: Any, vector: bool) -> float | Vec3:
-    def real(v: Any) -> bool:
-        return isinstance(v, (int, float)) and not isinstance(v, bool)
+def _is_real(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
 
+
+def _device_value(path: Path, key: str, value: Any) -> Any:
+    what = f"[device] {key}"
+    if key != "mixing":
+        return _number(path, what, value, key == "gamma")
+    if not isinstance(value, list) or len(value) != 3 or any(map(_is_real, value)):
+        raise InputError(f"{path}: {what} must be three lists of three numbers")
+    return tuple(_number(path, what, row, True) for row in value)
+
+
+def _number(path: Path, what: str, value: Any, vector: bool) -> float | Vec3:
     if vector:
-        if real(value):
+        if _is_real(value):
             return (float(value),) * 3
-        if isinstance(value, list) and len(value) == 3 and all(map(real, value)):
+        if isinstance(value, list) and len(value) == 3 and all(map(_is_real, value)):
             return (float(value[0]), float(value[1]), float(value[2]))
         raise InputError(f"{path}: {what} must be a number or a list of three")
-    if not real(value):
+    if not _is_real(value):
         quoted = " without quotes, with a point" if isinstance(value, str) else ""
         raise InputError(f"{path}: {what} must be a number{quoted}")
     return float(value)
 
 
-def write_rig(path: Path, rig: Rig, pattern: str = "", sample: str = "") -> None:
+def write_rig(
+    path: Path, rig: Rig, pattern: str = "", sample: str = "", device: Device | None = None
+) -> None:
     """Write ``rig.toml``. Fields at their default are left out where reading takes the default."""
-    default = Rig()
-    lines: list[str] = []
-    section_now = ""
-    entries: list[tuple[str, str, str]] = []
+    default, ideal = Rig(), Device()
+    sections: dict[str, list[str]] = {}
+
+    def state(section: str, key: str, value: Any) -> None:
+        sections.setdefault(section, []).append(f"{key} = {_text(value)}")
+
     for (section, key), name in _KEYS.items():
         value = getattr(rig, name)
         # What would else be looked for in the photo is always stated.
@@ -156,17 +192,23 @@ def write_rig(path: Path, rig: Rig, pattern: str = "", sample: str = "") -> None
             or name == "fov"
             or value != getattr(default, name)
         ):
-            if isinstance(value, str):
-                text = f'"{value}"'
-            else:
-                text = str(list(value)) if isinstance(value, tuple) else repr(float(value))
-            entries.append((section, key, text))
-    entries += [("pattern", "image", f'"{pattern}"')] if pattern else []
-    entries += [("sample", "maps", f'"{sample}"')] if sample else []
-    for section, key, text in entries:
-        if section != section_now:
-            lines.append(f"[{section}]")
-            section_now = section
-        lines.append(f"{key} = {text}")
+            state(section, key, value)
+    for key in _DEVICE if device else ():
+        if getattr(device, key) != getattr(ideal, key):
+            state("device", key, getattr(device, key))
+    if pattern:
+        state("pattern", "image", pattern)
+    if sample:
+        state("sample", "maps", sample)
+    text = "".join(f"[{name}]\n" + "".join(f"{x}\n" for x in sections[name]) for name in sections)
     with atomic_path(path) as temporary:
-        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8")
+
+
+def _text(value: Any) -> str:
+    """A value in TOML."""
+    if isinstance(value, str):
+        return f'"{value}"'
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(_text, value))}]"
+    return repr(float(value))

@@ -52,7 +52,7 @@ def _axes(figure: Any, x: float, y: float, scale: float) -> Any:
 
 
 def _guide(figure: Any, rig: Rig) -> None:
-    l, h, r = 1000 * rig.screen_size, 1000 * rig.screen_height, 1000 * rig.ball_radius
+    l, h, r = 1000 * rig.screen_sides[0], 1000 * rig.screen_height, 1000 * rig.ball_radius
     delta, axis = 1000 * rig.camera_offset, 1000 * rig.optical_axis_x
     left, right = -0.75 * l - delta, axis + r + 22 * l / 90
     wide, high = right - left + 40, 1.25 * h + l * 1.15

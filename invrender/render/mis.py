@@ -16,6 +16,7 @@ from invrender.render.scene import (
     Scene,
     View,
     aligned,
+    dimming,
     environment_at,
     equirect_uv,
     hash_bits,
@@ -172,11 +173,15 @@ def shade_mis(
                     r2 = dr.squared_norm(to)
                     moved = to * dr.rsqrt(r2)
                     m = dr.cross(scene.edge_x, scene.edge_y)
-                    g = dr.dot(m, moved) / r2
+                    g = dr.dot(m, moved)
+                    cos = g * dr.rsqrt(dr.squared_norm(m))
+                    g = g / r2
                     g = g / dr.select(on_screen, dr.detach(g), 1)
                 else:
                     moved, g = d, scalar(1)
                 light = pattern_at(scene, ps, pt)
+                if scene.falloff is not None:
+                    light = light * dimming(scene, cos)
                 if moving and has_env:
                     light = light - environment_at(scene, moved)
                 f = lobe(moved, rho, n)

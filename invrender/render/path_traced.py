@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from invrender.device import Device
 from invrender.maps import Maps
 from invrender.render import brdf
 from invrender.render.backend import BACKEND, dr
@@ -22,7 +23,8 @@ import mitsuba as mi  # isort: skip  (after the back end has chosen its LLVM)
 mi.set_variant(f"{BACKEND}_ad_rgb")
 mi.set_log_level(mi.LogLevel.Error)  # it warns of sample counts that it rounds
 
-SAMPLE_LIFT = 1e-4  # of the screen's size: the table lies that far below the sample
+# Of the screen's size: the table lies so far below the sample, the bezel so far above the lit area.
+SAMPLE_LIFT = 1e-4
 
 
 class CookTorrance(mi.BSDF):
@@ -133,6 +135,74 @@ class CookTorrance(mi.BSDF):
 mi.register_bsdf("invrender", lambda props: CookTorrance(props))
 
 
+class DimmingScreen(mi.Emitter):
+    """A rectangle's light that dims to the sides: radiance(u, v) · cos(θ)^falloff.
+
+    Parameters: radiance, a texture; corner, edge_x, edge_y of the rectangle, whose image has row 0
+    at +edge_y; falloff.
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        mi.Emitter.__init__(self, props)
+        self.radiance = props["radiance"]
+        vector = lambda name: mi.Vector3f(mi.ScalarVector3f(props[name]))  # noqa: E731
+        self.corner, self.e_x, self.e_y = (vector(k) for k in ("corner", "edge_x", "edge_y"))
+        across = dr.cross(self.e_y, self.e_x)
+        self.area = dr.norm(across)
+        self.down = across / self.area
+        self.falloff = mi.Float(props["falloff"])
+        self.m_flags = mi.EmitterFlags.Surface | mi.EmitterFlags.SpatiallyVarying
+        self.m_needs_sample_2 = True
+
+    def _light(self, si: mi.SurfaceInteraction3f, cos: mi.Float, active: mi.Bool) -> mi.Color3f:
+        active &= cos > 0
+        dims = dr.maximum(cos, 0) ** self.falloff
+        return dr.select(active, self.radiance.eval(si, active) * dims, 0)
+
+    def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Color3f:
+        return self._light(si, si.wi.z, mi.Bool(active))
+
+    def sample_direction(
+        self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool = True
+    ) -> tuple[mi.DirectionSample3f, mi.Color3f]:
+        ds = dr.zeros(mi.DirectionSample3f)
+        ds.p = mi.Point3f(self.corner + sample.x * self.e_x + sample.y * self.e_y)
+        ds.n = mi.Normal3f(self.down)
+        ds.uv = mi.Point2f(sample.x, 1 - sample.y)
+        ds.time = it.time
+        ds.d = ds.p - it.p
+        ds.dist = dr.norm(ds.d)
+        ds.d /= ds.dist
+        ds.emitter = mi.EmitterPtr(self)
+        active = mi.Bool(active) & (dr.dot(ds.d, ds.n) < 0)
+        ds.pdf = self.pdf_direction(it, ds, active)
+        value = self.eval_direction(it, ds, active)
+        return ds, dr.select(ds.pdf > 0, value / dr.select(ds.pdf > 0, ds.pdf, 1), 0)
+
+    def pdf_direction(
+        self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True
+    ) -> mi.Float:
+        cos = -dr.dot(ds.d, ds.n)
+        ahead = mi.Bool(active) & (cos > 0)
+        return dr.select(ahead, ds.dist * ds.dist / (dr.select(ahead, cos, 1) * self.area), 0)
+
+    def eval_direction(
+        self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True
+    ) -> mi.Color3f:
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        si.uv = ds.uv
+        return self._light(si, -dr.dot(ds.d, ds.n), mi.Bool(active))
+
+    def bbox(self) -> mi.ScalarBoundingBox3f:
+        return mi.ScalarBoundingBox3f()
+
+    def to_string(self) -> str:
+        return "DimmingScreen[]"
+
+
+mi.register_emitter("dimming_screen", lambda props: DimmingScreen(props))
+
+
 def _transform(columns: list[Array]) -> Any:
     matrix = np.eye(4)
     matrix[:3, :4] = np.stack(columns, -1)
@@ -152,6 +222,7 @@ def sample_scene(
     *,
     max_depth: int = 2,
     integrator: str = "path",
+    device: Device = Device(),  # noqa: B008  (frozen)
 ) -> mi.Scene:
     """The sample, the screen and the environment alone: what the estimators integrate.
 
@@ -169,7 +240,7 @@ def sample_scene(
                 "to_world": mi.ScalarTransform4f().scale([half, half, 1]),
                 "bsdf": _bsdf(maps),
             },
-            **_lights(rig, pattern, environment, gain),
+            **_lights(rig, pattern, environment, gain, device),
         }
     )
 
@@ -185,29 +256,29 @@ def _bsdf(maps: Maps) -> dict[str, Any]:
 
 
 def _lights(
-    rig: Rig, pattern: Array | None, environment: Array | None, gain: Any
+    rig: Rig, pattern: Array | None, environment: Array | None, gain: Any, device: Device
 ) -> dict[str, Any]:
     lights: dict[str, Any] = {}
     if pattern is not None:
-        e_x, e_y = rig.screen_edges
-        down = np.cross(e_y, e_x) / np.linalg.norm(e_x)
-        centre = rig.screen_corner + e_x / 2 + e_y / 2
-        # Mitsuba's rectangle has image row 0 at its -y; turned over, that is the screen's +y.
-        lights["screen"] = {
-            "type": "rectangle",
-            "to_world": _transform([e_x / 2, -e_y / 2, down, centre]),
-            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}},
-            "emitter": {
-                "type": "area",
-                "radiance": {
-                    "type": "bitmap",
-                    "bitmap": _bitmap(pattern * np.asarray(gain)),
-                    "raw": True,
-                    "wrap_mode": "clamp",
-                    "format": "variant",
-                },
-            },
+        corner, (e_x, e_y) = rig.screen_corner, rig.screen_edges
+        radiance = {
+            "type": "bitmap",
+            "bitmap": _bitmap(device.shown(pattern) * np.asarray(gain)),
+            "raw": True,
+            "wrap_mode": "clamp",
+            "format": "variant",
         }
+        emitter: dict[str, Any] = {"type": "area", "radiance": radiance}
+        if device.falloff:
+            place = {"corner": corner, "edge_x": e_x, "edge_y": e_y}
+            emitter |= {k: list(map(float, v)) for k, v in place.items()}
+            emitter |= {"type": "dimming_screen", "falloff": float(device.falloff)}
+        lights["screen"] = _black_rectangle(corner, e_x, e_y) | {"emitter": emitter}
+        if rig.screen_bezel:
+            corner, (b_x, b_y) = rig.screen_body
+            up = np.cross(b_x, b_y)
+            lift = up / np.linalg.norm(up) * (SAMPLE_LIFT * max(rig.screen_sides))
+            lights["bezel"] = _black_rectangle(corner + lift, b_x, b_y)
     if environment is not None:
         lights["environment"] = {
             "type": "envmap",
@@ -217,6 +288,17 @@ def _lights(
             ),
         }
     return lights
+
+
+def _black_rectangle(corner: Array, e_x: Array, e_y: Array) -> dict[str, Any]:
+    """Facing down. Mitsuba's rectangle has image row 0 at its -y; turned over, that is +e_y."""
+    down = np.cross(e_y, e_x)
+    down = down / np.linalg.norm(down)
+    return {
+        "type": "rectangle",
+        "to_world": _transform([e_x / 2, -e_y / 2, down, corner + e_x / 2 + e_y / 2]),
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}},
+    }
 
 
 def path_traced(
@@ -249,9 +331,10 @@ def photograph(
     max_depth: int = 4,
     table: Any = 0.3,
     seed: int = 0,
+    device: Device = Device(),  # noqa: B008  (frozen)
 ) -> Array:
     """The whole photo (H, W, 3), linear: sample, mirror ball, diffuse table, light between them."""
-    half, size = rig.sample_size / 2, rig.screen_size
+    half, size = rig.sample_size / 2, max(rig.screen_sides)
     camera, (right, up, back) = rig.camera, rig.camera_axes
     table = np.broadcast_to(np.asarray(table, dtype=float), 3)
     scene = mi.load_dict(
@@ -298,7 +381,7 @@ def photograph(
                     "specular_reflectance": {"type": "rgb", "value": list(rig.ball_reflectance)},
                 },
             },
-            **_lights(rig, pattern, environment, gain),
+            **_lights(rig, pattern, environment, gain, device),
         }
     )
     return np.array(mi.render(scene, spp=spp, seed=seed))

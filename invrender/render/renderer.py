@@ -1,7 +1,7 @@
 """Radiance of the sample as the camera sees it, with its derivatives.
 
     I(x) = ∫ f(l, v) L(x, l) (n·l)+ dl over z > 0,
-    L = gain × pattern where x + r·l meets the screen, else the environment.
+    L = gain × pattern × cos(θ)^falloff where x + r·l meets the screen, else the environment.
 
 `invrender.render.Fast` is nearly free of noise and has a small bias; `invrender.render.Mis` is
 unbiased. The table is a plane and the ball is small: one bounce is
@@ -22,7 +22,7 @@ from invrender.lights import Lights
 from invrender.maps import Maps
 from invrender.render import brdf
 from invrender.render.backend import Float, dr, vector
-from invrender.render.scene import Scene, View, aligned, make_scene, make_view
+from invrender.render.scene import Scene, View, aligned, make_view, scene_under
 from invrender.render.shading import Shading
 
 TILE = 1 << 20  # pixels rendered at once
@@ -59,7 +59,7 @@ class Renderer(ABC):
     @classmethod
     def under(cls, lights: Lights) -> Self:
         """Prepared for these lights."""
-        return cls(make_scene(lights.rig, lights.pattern, lights.environment, lights.gain))
+        return cls(scene_under(lights))
 
     @abstractmethod
     def _shade(

@@ -1,9 +1,9 @@
 """A rig under its lights as Dr.Jit arrays, and its pixels.
 
-The screen is a rectangle corner + s·e_x + t·e_y, (s, t) in [0, 1]², that emits gain × pattern
-towards the sample and hides the environment behind it; the environment is an equirectangular image
-at infinity. Any field of a `Scene` may carry gradients; a light that a scene lacks is None and is
-never traced into a kernel.
+The screen is a rectangle corner + s·e_x + t·e_y, (s, t) in [0, 1]², that emits gain × pattern ×
+cos(θ)^falloff towards the sample and hides the environment behind it; its border may be a black
+bezel. The environment is an equirectangular image at infinity. Any field of a `Scene` may carry
+gradients; what a scene lacks is None and is never traced into a kernel.
 """
 
 from __future__ import annotations
@@ -13,16 +13,23 @@ from typing import Any
 
 import numpy as np
 
+from invrender.device import Device
+from invrender.lights import Lights
 from invrender.render.backend import Float, ad, dr, vector
 from invrender.rig import Rig
 from invrender.types import InputError
+
+LEAST_COS = 1e-6  # at the screen, of directions that meet it: its power has a finite derivative
 
 
 @dataclass
 class Scene:
     """One rig under its lights. Scalars and vectors have width 1, textures are flat RGB.
 
-    pattern: P·P·3 values of relative radiance, row 0 at +y; environment: H·2H·3, row 0 at +z.
+    corner, edge_x, edge_y: of the screen with its bezel. pattern: values of relative radiance in
+    ``pattern_shape`` (rows, columns), row 0 at +y. environment: H·2H·3, row 0 at +z. falloff: the
+    display's exponent, None where it dims to no side. bezel: its shares of the screen's width and
+    depth on each side, None where there is none.
     """
 
     camera: Any
@@ -30,12 +37,14 @@ class Scene:
     edge_x: Any
     edge_y: Any
     pattern: Any | None
-    pattern_size: int
+    pattern_shape: tuple[int, int]
     gain: Any
     environment: Any | None
     env_height: int
     scale: Any
     half: Any  # half-width of the sample, metres
+    falloff: Any | None = None
+    bezel: tuple[Any, Any] | None = None
 
     @property
     def scalar(self) -> type:
@@ -50,47 +59,75 @@ def make_scene(
     gain: Any = 1.0,
     scale: float = 1.0,
     scalar: type = Float,
+    device: Device | None = None,
 ) -> Scene:
-    """A `Scene` from (P, P, 3) pattern and (H, 2H, 3) environment arrays, either may be None.
+    """A `Scene` from (h, w, 3) pattern and (H, 2H, 3) environment arrays, either may be None.
 
-    gain: RGB radiance of the pattern's white; scale multiplies the environment. Raises `InputError`
-    for wrong shapes and for negative or non-finite lights.
+    gain: RGB radiance of the pattern's white; scale multiplies the environment; device: the display
+    that shows the pattern, an ideal one if it is None. Raises `InputError` for wrong shapes and for
+    negative or non-finite lights.
     """
     vec3 = vector(scalar, 3)
-
-    def light(image: Any | None, name: str, aspect: int) -> tuple[Any | None, int]:
-        if image is None:
-            return None, 0
-        image = np.asarray(image)
-        if image.ndim != 3 or image.shape[2] != 3 or image.shape[1] != aspect * image.shape[0]:
-            raise InputError(f"{name} must be (H, {aspect}H, 3), got {image.shape}")
-        if not np.all(np.isfinite(image)) or image.min() < 0:
-            raise InputError(f"{name} has negative or non-finite values")
-        return scalar(aligned(image.ravel(), scalar)), image.shape[0]
-
-    flat_env, env_height = light(environment, "environment", 2)
-    if environment is not None and not np.any(environment):
-        flat_env, env_height = None, 0
-    flat_pattern, pattern_size = light(pattern, "pattern", 1)
-    if pattern is not None and not np.any(pattern) and flat_env is None:
-        flat_pattern, pattern_size = None, 0  # a black screen matters where it hides something
-    edge_x, edge_y = rig.screen_edges
+    flat_env, flat_pattern = None, None
+    env_height, pattern_shape = 0, (0, 0)
+    if environment is not None:
+        environment = _checked(environment, "environment", "(H, 2H, 3)")
+        if environment.shape[1] != 2 * environment.shape[0]:
+            raise InputError(f"environment must be (H, 2H, 3), got {environment.shape}")
+        if np.any(environment):
+            flat_env = scalar(aligned(environment.ravel(), scalar))
+            env_height = environment.shape[0]
+    if pattern is not None:
+        pattern = _checked(pattern, "pattern", "(H, W, 3)")
+        if device is not None:
+            pattern = device.shown(pattern)
+        # A black screen matters where it hides something.
+        if np.any(pattern) or flat_env is not None:
+            flat_pattern = scalar(aligned(pattern.ravel(), scalar))
+            pattern_shape = (pattern.shape[0], pattern.shape[1])
+    corner, (edge_x, edge_y) = rig.screen_body
     # Opaque, so that new values of the pose, the gain or the scale do not compile new kernels.
     opaque = lambda v: dr.opaque(scalar, float(v))  # noqa: E731
     place = lambda p: vec3(*(opaque(c) for c in p))  # noqa: E731
+    lit = flat_pattern is not None
+    dims = lit and device is not None and device.falloff != 0
+    bezel = None
+    if lit and rig.screen_bezel != 0:
+        width, depth = rig.screen_sides
+        b = rig.screen_bezel
+        bezel = opaque(b / (width + 2 * b)), opaque(b / (depth + 2 * b))
     return Scene(
         camera=place(rig.camera),
-        corner=place(rig.screen_corner),
+        corner=place(corner),
         edge_x=place(edge_x),
         edge_y=place(edge_y),
         pattern=flat_pattern,
-        pattern_size=pattern_size,
+        pattern_shape=pattern_shape,
         gain=place(np.broadcast_to(np.asarray(gain, dtype=float), 3)),
         environment=flat_env,
         env_height=env_height,
         scale=opaque(scale),
         half=opaque(rig.sample_size / 2),
+        falloff=opaque(device.falloff) if dims and device is not None else None,
+        bezel=bezel,
     )
+
+
+def scene_under(lights: Lights, scale: float = 1.0, scalar: type = Float) -> Scene:
+    """The `Scene` of lights, all of them times ``scale``."""
+    gain = np.asarray(lights.gain) * scale
+    return make_scene(
+        lights.rig, lights.pattern, lights.environment, gain, scale, scalar, lights.device
+    )
+
+
+def _checked(image: Any, name: str, shape: str) -> np.ndarray:
+    image = np.asarray(image)
+    if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
+        raise InputError(f"{name} must be {shape}, got {image.shape}")
+    if not np.all(np.isfinite(image)) or image.min() < 0:
+        raise InputError(f"{name} has negative or non-finite values")
+    return image
 
 
 def _bilinear(texture: Any, height: int, width: int, x: Any, y: Any, wrap: bool) -> Any:
@@ -115,10 +152,27 @@ def _bilinear(texture: Any, height: int, width: int, x: Any, y: Any, wrap: bool)
     )
 
 
-def pattern_at(scene: Scene, s: Any, t: Any) -> Any:
-    """Radiance gain × pattern at the screen's (s, t), bilinear, clamped at the border."""
-    n = scene.pattern_size
-    return scene.gain * _bilinear(scene.pattern, n, n, s * n, (1 - t) * n, wrap=False)
+def pattern_at(scene: Scene, s: Any, t: Any, texel: float = 0.0) -> Any:
+    """Radiance straight ahead, gain × pattern, at the screen's (s, t): bilinear, clamped at the
+    border, black on the bezel.
+
+    texel: side of the square of (s, t) over which the bezel's edge is averaged, none if 0.
+    """
+    rows, columns = scene.pattern_shape
+    lit: Any = 1
+    if scene.bezel is not None:
+        for p, b in ((s, scene.bezel[0]), (t, scene.bezel[1])):
+            inside = dr.minimum(p - b, 1 - b - p)  # distance from the edge
+            lit *= dr.clip(inside / texel + 0.5, 0, 1) if texel else dr.select(inside > 0, 1, 0)
+        s, t = ((p - b) / (1 - 2 * b) for p, b in zip((s, t), scene.bezel, strict=True))
+    x, y = s * columns, (1 - t) * rows
+    return scene.gain * lit * _bilinear(scene.pattern, rows, columns, x, y, wrap=False)
+
+
+def dimming(scene: Scene, cos: Any) -> Any:
+    """Radiance towards an angle of cosine ``cos`` from the screen's normal, relative to straight
+    ahead; 1 where the display dims to no side."""
+    return 1 if scene.falloff is None else dr.maximum(cos, LEAST_COS) ** scene.falloff
 
 
 def equirect_uv(d: Any) -> tuple[Any, Any]:
@@ -157,7 +211,7 @@ class ScreenFrame:
         Rays that are not ahead have (s, t) of no meaning and r = distance.
         """
         cos = dr.dot(d, self.normal)
-        ahead = (cos > 1e-6) & (self.distance > 0)
+        ahead = (cos > LEAST_COS) & (self.distance > 0)
         r = self.distance / dr.select(ahead, cos, 1)
         s = dr.fma(r, dr.dot(d, self.along_s), self.s)
         t = dr.fma(r, dr.dot(d, self.along_t), self.t)

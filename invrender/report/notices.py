@@ -30,7 +30,7 @@ def map_notices(
     def note(code: str, text: str) -> None:
         notices.append(Notice(code, text))
 
-    if fit.get("screen_shift", 0) > FAR_OFF * lights.rig.screen_size:
+    if fit.get("screen_shift", 0) > FAR_OFF * max(lights.rig.screen_sides):
         note(
             "screen-far-off",
             f"in the ball, the screen hangs {1000 * fit['screen_shift']:.0f} mm from where "

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from invrender.colour import srgb_to_linear
+from invrender.device import Device
 from invrender.files.images import read_image
 from invrender.files.maps import read_maps, write_maps
 from invrender.files.rig_toml import read_rig, write_rig
@@ -90,16 +91,18 @@ class Result:
         rendering = self.render() if self.rendering is None else self.rendering
         screen = lights.pattern_captured
         if screen is None:
-            screen = lights.pattern * np.asarray(lights.gain, np.float32)
+            screen = lights.shown * np.asarray(lights.gain, np.float32)
         width = lights.rig.sample_size
         write_maps(folder, maps, width=width)
         for key, image in sigma.items():
             write_exr(folder / f"sigma_{key}.exr", image, data=True, width=width)
         for key, image in maps.encoded().items():
             write_png(folder / f"{key}.png", image, linear=key in ("normal", "roughness"))
-        write_rig(folder / "rig.toml", lights.rig)
+        # The pattern is saved as it is shown: only the dimming to the sides is left to tell.
+        falloff = Device(falloff=lights.device.falloff)
+        write_rig(folder / "rig.toml", lights.rig, device=falloff)
         write_exr(folder / "environment.exr", lights.environment)
-        write_exr(folder / "pattern_shown.exr", lights.pattern)
+        write_exr(folder / "pattern_shown.exr", lights.shown)
         write_exr(folder / "pattern_captured.exr", screen)
         if lights.coverage is not None:
             write_exr(folder / "coverage.exr", lights.coverage)
@@ -130,13 +133,15 @@ class Result:
         coverage = folder / "coverage.exr"
         fit = dict(report.capture_fit)
         gain = np.asarray(fit.pop("gain"), np.float32)
+        told = read_rig(folder / "rig.toml")
         lights = Lights(
-            read_rig(folder / "rig.toml").rig,
+            told.rig,
             read_image(folder / "pattern_shown.exr"),
             read_image(folder / "environment.exr"),
             gain,
             read_image(coverage)[..., 0] if coverage.exists() else None,
             read_image(folder / "pattern_captured.exr"),
             {k: v for k, v in fit.items() if k not in _BALL and isinstance(v, float)},
+            told.device or Device(),
         )
         return cls(Estimate(maps, sigma), lights, read_image(folder / "sample.exr"), report)

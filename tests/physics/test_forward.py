@@ -308,7 +308,7 @@ def test_nothing_is_recompiled(estimator):
 def test_inputs_are_checked():
     good = np.ones((4, 4, 3))
     with pytest.raises(InputError, match="pattern must be"):
-        make_scene(Rig(), np.ones((4, 5, 3)), None)
+        make_scene(Rig(), np.ones((4, 5)), None)
     with pytest.raises(InputError, match="environment must be"):
         make_scene(Rig(), None, np.ones((4, 4, 3)))
     with pytest.raises(InputError, match="negative or non-finite"):

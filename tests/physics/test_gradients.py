@@ -12,6 +12,7 @@ from forward_scenes import (
     some_pattern,
 )
 
+from invrender.device import Device
 from invrender.maps import constant_maps
 from invrender.render import brdf
 from invrender.render.backend import Float, ad, dr, vector
@@ -29,11 +30,17 @@ LIGHTS = {
     "environment": (None, some_environment()),
     "smooth": (some_pattern(), some_environment(sun=0, lamps=0)),
 }
+LIGHTS |= {"display": LIGHTS["both"], "smooth display": LIGHTS["smooth"]}
+WIDE = Rig(screen_size=(0.228, 0.16), screen_bezel=0.01, camera_height=0.17)
 
 
 def a_scene(lights, scalar=Float64, rig=None):
+    """Lights of that name; those of a display dim to the sides and have a bezel."""
     pattern, environment = LIGHTS[lights]
-    return make_scene(rig or Rig(), pattern, environment, (4.0, 3.0, 5.0), 1.3, scalar)
+    real = "display" in lights
+    device = Device(falloff=0.8) if real else None
+    rig = rig or (WIDE if real else Rig())
+    return make_scene(rig, pattern, environment, (4.0, 3.0, 5.0), 1.3, scalar, device)
 
 
 def numpy(array):
@@ -69,6 +76,8 @@ SLOW = pytest.mark.slow  # more kernels to compile, no more code to cover
 CASES = [
     ("fast", "both"),
     ("mis", "both"),
+    ("fast", "display"),
+    pytest.param("mis", "display", marks=SLOW),
     pytest.param("fast", "environment", marks=SLOW),
     pytest.param("fast", "screen", marks=SLOW),
     pytest.param("mis", "screen", marks=SLOW),
@@ -251,6 +260,30 @@ def test_light_derivatives(estimator, field, index):
     assert grad == pytest.approx(fd, rel=1e-7 if held else 0.02)
 
 
+@pytest.mark.parametrize("estimator, field", [("fast", "falloff"), ("fast", "bezel"),
+                                              ("mis", "falloff")])  # fmt: skip
+def test_display_derivatives(estimator, field):
+    """By the exponent of the dimming, and (the fast estimator's edges are soft) by the bezel's
+    width; summed over extreme configurations."""
+    scene = a_scene("display")
+    view, m = configuration_view(scene, extreme_configurations(256, seed=1))
+    m.roughness = dr.maximum(m.roughness, 0.1)
+
+    def total(value):
+        moved = {"falloff": value} if field == "falloff" else {"bezel": (value, scene.bezel[1])}
+        color = ESTIMATORS[estimator](replace(scene, **moved)).radiance(view, m, 32)
+        return dr.sum(dr.sum(color))
+
+    start = Float64(scene.falloff if field == "falloff" else scene.bezel[0])
+    leaf = Float64(start)
+    dr.enable_grad(leaf)
+    dr.backward(total(leaf))
+    h = 1e-6
+    expected = central(lambda d: numpy(total(start + d)), h)[0]
+    assert abs(expected) > 1
+    assert float(dr.grad(leaf)[0]) == pytest.approx(expected, rel=1e-6)
+
+
 POSES = [("screen_shift", 0), ("screen_shift", 1), ("screen_shift", 2)]
 POSES += [("screen_tilt", 0), ("screen_tilt", 1), ("screen_tilt", 2)]
 POSES += [("camera_shift", 0), ("camera_shift", 1), ("camera_shift", 2)]
@@ -259,7 +292,8 @@ POSES += [("camera_shift", 0), ("camera_shift", 1), ("camera_shift", 2)]
 def pose_scene(lights, field, axis, delta):
     shift = [0.0, 0.0, 0.0]
     shift[axis] = delta
-    return a_scene(lights, rig=replace(Rig(), **{field: tuple(shift)}))
+    rig = WIDE if "display" in lights else Rig()
+    return a_scene(lights, rig=replace(rig, **{field: tuple(shift)}))
 
 
 POSE_FIELDS = ("corner", "edge_x", "edge_y", "camera")
@@ -282,9 +316,14 @@ def pose_tangent(lights, field, axis):
 
 
 @pytest.mark.parametrize(
-    "field, axis", [p if i % 2 == 0 else pytest.param(*p, marks=SLOW) for i, p in enumerate(POSES)]
+    "lights, field, axis",
+    [
+        ("both", *p) if i % 2 == 0 else pytest.param("both", *p, marks=SLOW)
+        for i, p in enumerate(POSES)
+    ]
+    + [pytest.param("display", "screen_shift", 2, marks=SLOW), ("display", "screen_tilt", 1)],
 )
-def test_pose_derivatives_fast(field, axis):
+def test_pose_derivatives_fast(lights, field, axis):
     """Pixel by pixel: the fast estimator's edges are soft, so its derivative has no jumps."""
     n, samples = 16, 16
     m = Material(0.4, 0.3, Float64(0.35), vector(Float64, 3)(0.1, -0.2, 1))
@@ -293,24 +332,30 @@ def test_pose_derivatives_fast(field, axis):
         view = make_view(scene, n, n)
         return Fast(scene).radiance(view, m, samples)
 
-    scene, leaves = pose_tangent("both", field, axis)
+    scene, leaves = pose_tangent(lights, field, axis)
     color = image(scene)
     dr.enqueue(dr.ADMode.Forward, leaves)
     dr.traverse(dr.ADMode.Forward)
     found = numpy(dr.grad(color))
     h = 1e-7 if "shift" in field else 1e-5
     fd = (
-        numpy(image(pose_scene("both", field, axis, h)))
-        - numpy(image(pose_scene("both", field, axis, -h)))
+        numpy(image(pose_scene(lights, field, axis, h)))
+        - numpy(image(pose_scene(lights, field, axis, -h)))
     ) / (2 * h)
     norm = np.linalg.norm(found - fd) / np.linalg.norm(fd)
     assert norm < 1e-3, f"relative error {norm:.1e}"
 
 
 @pytest.mark.parametrize(
-    "field, axis", [("screen_shift", 0), ("screen_tilt", 1), ("camera_shift", 0)]
+    "lights, field, axis",
+    [
+        ("smooth", "screen_shift", 0),
+        ("smooth", "screen_tilt", 1),
+        ("smooth", "camera_shift", 0),
+        ("smooth display", "screen_tilt", 1),
+    ],
 )
-def test_pose_derivatives_mis(field, axis):
+def test_pose_derivatives_mis(lights, field, axis):
     """The mean over pixels: mis's derivative, which has no visibility edge, is unbiased.
 
     Under smooth light; a lamp behind the screen's edge makes it noisy (measured: 5% at 1,024
@@ -323,7 +368,7 @@ def test_pose_derivatives_mis(field, axis):
         view = make_view(scene, n, n, seed)
         return Mis(scene).radiance(view, m, samples)
 
-    scene, leaves = pose_tangent("smooth", field, axis)
+    scene, leaves = pose_tangent(lights, field, axis)
     color = image(scene, 256)
     dr.enqueue(dr.ADMode.Forward, leaves)
     dr.traverse(dr.ADMode.Forward)
@@ -331,8 +376,8 @@ def test_pose_derivatives_mis(field, axis):
     h = 1e-3 if "shift" in field else 1.0
     fd = [
         (
-            numpy(image(pose_scene("smooth", field, axis, h), 2048, seed))
-            - numpy(image(pose_scene("smooth", field, axis, -h), 2048, seed))
+            numpy(image(pose_scene(lights, field, axis, h), 2048, seed))
+            - numpy(image(pose_scene(lights, field, axis, -h), 2048, seed))
         ).mean()
         / (2 * h)
         for seed in range(2)

@@ -4,6 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from invrender.device import Device
 from invrender.files.rig_toml import read_rig, write_rig
 from invrender.rig import Rig
 from invrender.types import InputError
@@ -90,6 +91,46 @@ def test_file_round_trip(tmp_path):
     write_rig(tmp_path / "rig.toml", rig, "p.png", "truth/")
     found = read_rig(tmp_path / "rig.toml")
     assert (found.rig, found.files) == (rig, {"pattern": "p.png", "sample": "truth/"})
+    assert found.device is None
+
+
+def test_file_round_trip_of_a_real_rig(tmp_path):
+    rig = Rig(
+        screen_size=(0.228, 0.16), screen_bezel=0.01, camera_height=0.2, sample_side=0.07,
+        screen_shift=tuple(np.array([1e-3, 0, 0])),
+    )  # fmt: skip
+    mixing = ((0.9, 0.1, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    device = Device(falloff=0.7, gamma=(1.1, 1.0, 0.9), black=0.01, mixing=mixing)
+    write_rig(tmp_path / "rig.toml", rig, sample="truth/", device=device)
+    found = read_rig(tmp_path / "rig.toml")
+    assert (found.rig, found.files, found.device) == (rig, {"sample": "truth/"}, device)
+
+
+def test_a_rectangle_is_the_square_that_a_square_is():
+    """What rig.toml says in one number or two is one rig, where a square of side l has a = l/4."""
+    l, delta = 0.2, 0.01
+    square = Rig(l, 0.16, delta)
+    for rig in (square, Rig((l, l), 0.16, delta), Rig(l, 0.16, delta, sample_side=l / 2)):
+        assert rig.optical_axis_x == pytest.approx(l / 4 + delta)
+        np.testing.assert_allclose(rig.screen_corner, [-0.75 * l - delta, -l / 2, 0.16])
+        np.testing.assert_allclose(sum(rig.screen_edges), [l, l, 0])
+    wide = Rig((0.228, 0.16), 0.16, delta, screen_bezel=0.008, camera_height=0.25)
+    assert wide.sample_size == 0.08
+    corner, (e_x, e_y) = wide.screen_body
+    # The gap to the optical axis is twice delta, less the bezel; the camera is where it is said.
+    assert wide.optical_axis_x - (corner + e_x)[0] == pytest.approx(2 * delta - 0.008)
+    np.testing.assert_allclose(e_y, [0, 0.176, 0])
+    np.testing.assert_allclose(wide.camera, [0.05, 0, 0.25])
+
+
+def test_dimming_lowers_the_screens_cosines_by_its_power():
+    rig = Rig()
+    plain, dimmed = (rig.screen_cosines(np.zeros(3), 8, e) for e in (0.0, 1.5))
+    e_x, e_y = rig.screen_edges
+    t = (np.arange(8) + 0.5) / 8
+    middle = rig.screen_corner + t[:, None] * e_x + (1 - t)[:, None, None] * e_y
+    cosine = rig.screen_height / np.linalg.norm(middle, axis=-1)
+    np.testing.assert_allclose(dimmed, plain * cosine**1.5)
 
 
 def test_fov_of_the_file_comes_before_that_of_the_exif(tmp_path):
@@ -108,6 +149,13 @@ def test_fov_of_the_file_comes_before_that_of_the_exif(tmp_path):
         ("size = 0.2", "size = nan", "must be finite"),
         ("size = 0.2", "size = true", "must be a number"),
         ("size = 0.2", 'size = "big"', "must be a number"),
+        ("size = 0.2", "size = [0.2]", r"a number or \[width, depth\]"),
+        ("size = 0.2", "size = [0.2, -0.1]", "must be positive"),
+        ("size = 0.2", "size = 0.2\nbezel = -0.1", "must not be negative"),
+        ("offset = 0.01", "offset = 0.01\nheight = 0", "camera_height must be positive"),
+        ("[pattern]", "[device]\nfalloff = -1\n[pattern]", "falloff must lie"),
+        ("[pattern]", "[device]\nmixing = [1, 0, 0]\n[pattern]", "three lists of three"),
+        ("[pattern]", "[device]\ncurve = 1\n[pattern]", "known keys: black, falloff"),
         ("size = 0.2", "sise = 0.2", "unknown key 'sise'"),
         ("size = 0.2", "", "size is missing"),
         ("size = 0.2", "size = ", "not valid TOML"),

@@ -10,7 +10,7 @@ from typing import Any
 
 from invrender.render.backend import dr, vector
 from invrender.render.fast.pyramid import Pyramid, disc, disc_direction, disc_level, level_offset
-from invrender.render.scene import Scene
+from invrender.render.scene import Scene, dimming
 
 NORMALS = 24  # a side in the table of T
 EXTENT = 1.1  # of its square beyond the unit disc, so that the rim is interpolated too
@@ -118,6 +118,8 @@ def screen_cell(
         place = level_offset(screen.n, level) + (row + 1) * (side + 2) + column + 1
         texel = dr.gather(vec4, screen.texels, uint(place))
         radiance = vec3(texel.x, texel.y, texel.z)
+        if scene.falloff is not None:
+            radiance = radiance * dimming(scene, facing * dr.rsqrt(dr.squared_norm(area)))
     if sky is not None:
         x, y = disc(d)
         level = disc_level(sky.n, omega) - 0.5

@@ -13,7 +13,7 @@ from invrender.render import brdf
 from invrender.render.backend import dr, vector
 from invrender.render.fast.pyramid import disc, disc_level, square_level
 from invrender.render.fast.tables import Tables
-from invrender.render.scene import ScreenFrame, View, unit
+from invrender.render.scene import ScreenFrame, View, dimming, unit
 
 SCREEN_BIAS, SKY_BIAS = 0.0, -0.5  # levels added to a look-up whose footprint is a sample's share
 MIN_COVER = 0.02  # of a sky footprint that the screen does not always hide
@@ -24,23 +24,25 @@ class Sample:
     """A sample of the specular lobe: what is looked up where, or a derivative of that.
 
     weight: G2/G1, or zero where nothing is reflected. screen: (s, 1 - t, level). sky: (x, y, level)
-    on the disc's square.
+    on the disc's square. dimming: of the display towards the sample, where it dims sideways.
     """
 
     weight: Any
     fresnel: Any
     screen: Any
     sky: Any
+    dimming: Any = ()
 
     def flat(self) -> tuple[Any, ...]:
-        return (self.weight, self.fresnel, *self.screen, *self.sky)
+        return (self.weight, self.fresnel, *self.screen, *self.sky, *self.dimming)
 
     @staticmethod
     def of(tables: Tables, flat: Any) -> Sample:
         """Inverse of `flat`."""
         weight, fresnel, *rest = flat
         n = 3 if tables.screen is not None else 0
-        return Sample(weight, fresnel, list(rest[:n]), list(rest[n:]))
+        m = n + 3 if tables.sky is not None else n
+        return Sample(weight, fresnel, list(rest[:n]), list(rest[n:m]), list(rest[m:]))
 
 
 def sample_lobe(
@@ -74,7 +76,7 @@ def sample_lobe(
     weight = lz * (v.z + root_v) / dr.fma(v.z, root_l, lz * root_v)  # G2 / G1(v)
     pdf = brdf.ggx_d(h, alpha) / (2 * (v.z + root_v))
     omega = dr.minimum(inv_n / pdf, 2 * dr.pi)
-    on_screen, on_sky = [], []
+    on_screen, on_sky, dims = [], [], []
     if screen is not None and tables.screen is not None:
         ps, pt, r, cos, ahead = screen.hit(d)
         area = omega * r * r / (dr.select(ahead, cos, 1) * screen.area)
@@ -84,11 +86,13 @@ def sample_lobe(
             dr.select(ahead, 1 - pt, -8),
             square_level(tables.screen.n, area) + SCREEN_BIAS,
         ]
+        if tables.scene.falloff is not None:
+            dims = [dimming(tables.scene, dr.select(ahead, cos, 1))]
     if tables.sky is not None:
         x, y = disc(d)
         level = disc_level(tables.sky.n, omega) + SKY_BIAS
         on_sky = [dr.fma(x, 0.5, 0.5), dr.fma(y, -0.5, 0.5), level]
-    return Sample(dr.select(valid, weight, 0), brdf.schlick(v_h), on_screen, on_sky)
+    return Sample(dr.select(valid, weight, 0), brdf.schlick(v_h), on_screen, on_sky, dims)
 
 
 def _rgb(v: Any) -> Any:
@@ -102,6 +106,8 @@ def reflected(tables: Tables, sample: Sample) -> list[Any]:
     if tables.screen is not None:
         rgba = tables.screen(*sample.screen)
         light, share = _rgb(rgba), 1 - rgba.w
+        for dims in sample.dimming:
+            light = light * dims
     if tables.sky is not None:
         rgba = tables.sky(*sample.sky)
         light = light + _rgb(rgba) * (share / dr.maximum(rgba.w, MIN_COVER))
@@ -125,6 +131,10 @@ def reflected_rows(tables: Tables, sample: Sample, tangents: list[Sample]) -> li
         for k, t in enumerate(tangents):
             d = chain(slopes, t.screen)
             d_light[k], d_share[k] = _rgb(d), -d.w
+            for dims, slope in zip(sample.dimming, t.dimming, strict=True):
+                d_light[k] = d_light[k] * dims + light * slope
+        for dims in sample.dimming:
+            light = light * dims
     if tables.sky is not None:
         rgba, *slopes = tables.sky.slopes(*sample.sky)
         inverse = 1 / dr.maximum(rgba.w, MIN_COVER)

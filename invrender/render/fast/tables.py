@@ -68,9 +68,9 @@ def _grid(uint: type, scalar: type, n: int) -> tuple[Any, Any]:
 
 def _screen_pyramid(scene: Scene, detail: int) -> Pyramid:
     scalar = scene.scalar
-    n = max(_power_of_two(scene.pattern_size), SCREEN_TEXELS) * detail
+    n = max(_power_of_two(max(scene.pattern_shape)), SCREEN_TEXELS) * detail
     x, y = _grid(dr.uint32_array_t(scalar), scalar, n)
-    rgb = pattern_at(scene, x, 1 - y)
+    rgb = pattern_at(scene, x, 1 - y, 1 / n)
     return Pyramid.build(vector(scalar, 4)(rgb.x, rgb.y, rgb.z, 1), n)
 
 
