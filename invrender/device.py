@@ -71,3 +71,6 @@ class Device:
         """Radiance towards directions whose angles from the screen's normal have these cosines,
         relative to straight ahead."""
         return np.maximum(cosine, 0) ** self.falloff
+
+
+IDEAL = Device()

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from invrender.device import Device
+from invrender.device import IDEAL, Device
 from invrender.rig import Rig
 from invrender.sphere import rotate_environment
 from invrender.types import Array
@@ -47,7 +47,7 @@ class Lights:
     coverage: Array | None = None
     pattern_captured: Array | None = None
     fit: dict[str, float] = field(default_factory=dict)
-    device: Device = Device()
+    device: Device = IDEAL
 
     @property
     def shown(self) -> Array:

@@ -32,7 +32,7 @@ class Rig:
     ``screen_size``: of the lit area, a square's side or (along x, along y). ``sample_side``: of the
     square sample, by default half of the screen's shorter side. ``screen_bezel``: width of the
     black border around the lit area, which hides what is behind. ``camera_height``: by default the
-    screen's. ``ball_shape``: a "hemisphere" has its flat side on the table, a "sphere" stands on it.
+    screen's. ``ball_shape``: a "hemisphere" lies on its flat side, a "sphere" stands on the table.
     ``screen_shift`` and ``screen_tilt`` (a rotation vector about the screen's centre), and the
     same for the camera, say how a hand-held rig differs from the nominal one. Raises `InputError`
     for sizes that no rig has.

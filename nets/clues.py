@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from invrender.device import Device
+from invrender.device import IDEAL, Device
 from invrender.render.backend import Float, dr, vector
 from invrender.render.fast.estimator import Fast
 from invrender.render.scene import Scene, make_scene, make_view
@@ -93,11 +93,11 @@ def light_inputs(
     captured: Array | None = None,
     size: int = CLUE_SIZE,
     samples: int = CLUE_SAMPLES,
-    device: Device | None = None,
+    device: Device = IDEAL,
 ) -> dict[str, Array]:
     """The network's inputs that describe the light, as float32 arrays without a batch axis.
 
-    pattern (h, w, 3) as in `Lights`, shown by ``device`` (None: an ideal one) with gain RGB;
+    pattern (h, w, 3) as in `Lights`, shown by ``device`` with gain RGB;
     environment (H, 2H, 3) radiance or None; ``captured``: the screen's radiance as the ball shows
     it, if that is known. Of the display's dimming to the sides the prefiltered screen knows
     nothing, the clues do. Returns, channels
@@ -108,7 +108,7 @@ def light_inputs(
     gain = np.broadcast_to(np.asarray(gain, np.float32), 3)
     if not (np.any(pattern > 0) and np.any(gain > 0)):
         pattern, gain = np.ones((16, 16, 3), np.float32), np.zeros(3, np.float32)
-    lit = (pattern if device is None else device.shown(pattern)) * gain
+    lit = device.shown(pattern) * gain
     scene = make_scene(rig, pattern, None, gain, device=device)
     active, slopes = plane_clues(scene, size, samples)
     out = {

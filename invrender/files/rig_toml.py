@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from invrender.device import Device
+from invrender.device import IDEAL, Device
 from invrender.files.write import atomic_path
 from invrender.rig import BALL_SHAPES, Rig
 from invrender.types import InputError, Notice, Vec3
@@ -177,7 +177,7 @@ def write_rig(
     path: Path, rig: Rig, pattern: str = "", sample: str = "", device: Device | None = None
 ) -> None:
     """Write ``rig.toml``. Fields at their default are left out where reading takes the default."""
-    default, ideal = Rig(), Device()
+    default = Rig()
     sections: dict[str, list[str]] = {}
 
     def state(section: str, key: str, value: Any) -> None:
@@ -194,7 +194,7 @@ def write_rig(
         ):
             state(section, key, value)
     for key in _DEVICE if device else ():
-        if getattr(device, key) != getattr(ideal, key):
+        if getattr(device, key) != getattr(IDEAL, key):
             state("device", key, getattr(device, key))
     if pattern:
         state("pattern", "image", pattern)

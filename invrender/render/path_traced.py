@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from invrender.device import Device
+from invrender.device import IDEAL, Device
 from invrender.maps import Maps
 from invrender.render import brdf
 from invrender.render.backend import BACKEND, dr
@@ -222,7 +222,7 @@ def sample_scene(
     *,
     max_depth: int = 2,
     integrator: str = "path",
-    device: Device = Device(),  # noqa: B008  (frozen)
+    device: Device = IDEAL,
 ) -> mi.Scene:
     """The sample, the screen and the environment alone: what the estimators integrate.
 
@@ -331,7 +331,7 @@ def photograph(
     max_depth: int = 4,
     table: Any = 0.3,
     seed: int = 0,
-    device: Device = Device(),  # noqa: B008  (frozen)
+    device: Device = IDEAL,
 ) -> Array:
     """The whole photo (H, W, 3), linear: sample, mirror ball, diffuse table, light between them."""
     half, size = rig.sample_size / 2, max(rig.screen_sides)

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from invrender.device import Device
+from invrender.device import IDEAL, Device
 from invrender.lights import Lights
 from invrender.render.backend import Float, ad, dr, vector
 from invrender.rig import Rig
@@ -59,12 +59,12 @@ def make_scene(
     gain: Any = 1.0,
     scale: float = 1.0,
     scalar: type = Float,
-    device: Device | None = None,
+    device: Device = IDEAL,
 ) -> Scene:
     """A `Scene` from (h, w, 3) pattern and (H, 2H, 3) environment arrays, either may be None.
 
     gain: RGB radiance of the pattern's white; scale multiplies the environment; device: the display
-    that shows the pattern, an ideal one if it is None. Raises `InputError` for wrong shapes and for
+    that shows the pattern. Raises `InputError` for wrong shapes and for
     negative or non-finite lights.
     """
     vec3 = vector(scalar, 3)
@@ -79,8 +79,7 @@ def make_scene(
             env_height = environment.shape[0]
     if pattern is not None:
         pattern = _checked(pattern, "pattern", "(H, W, 3)")
-        if device is not None:
-            pattern = device.shown(pattern)
+        pattern = device.shown(pattern)
         # A black screen matters where it hides something.
         if np.any(pattern) or flat_env is not None:
             flat_pattern = scalar(aligned(pattern.ravel(), scalar))
@@ -90,7 +89,6 @@ def make_scene(
     opaque = lambda v: dr.opaque(scalar, float(v))  # noqa: E731
     place = lambda p: vec3(*(opaque(c) for c in p))  # noqa: E731
     lit = flat_pattern is not None
-    dims = lit and device is not None and device.falloff != 0
     bezel = None
     if lit and rig.screen_bezel != 0:
         width, depth = rig.screen_sides
@@ -108,7 +106,7 @@ def make_scene(
         env_height=env_height,
         scale=opaque(scale),
         half=opaque(rig.sample_size / 2),
-        falloff=opaque(device.falloff) if dims and device is not None else None,
+        falloff=opaque(device.falloff) if lit and device.falloff != 0 else None,
         bezel=bezel,
     )
 

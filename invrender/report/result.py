@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from invrender.colour import srgb_to_linear
-from invrender.device import Device
+from invrender.device import IDEAL, Device
 from invrender.files.images import read_image
 from invrender.files.maps import read_maps, write_maps
 from invrender.files.rig_toml import read_rig, write_rig
@@ -142,6 +142,6 @@ class Result:
             read_image(coverage)[..., 0] if coverage.exists() else None,
             read_image(folder / "pattern_captured.exr"),
             {k: v for k, v in fit.items() if k not in _BALL and isinstance(v, float)},
-            told.device or Device(),
+            told.device or IDEAL,
         )
         return cls(Estimate(maps, sigma), lights, read_image(folder / "sample.exr"), report)

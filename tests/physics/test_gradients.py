@@ -38,7 +38,7 @@ def a_scene(lights, scalar=Float64, rig=None):
     """Lights of that name; those of a display dim to the sides and have a bezel."""
     pattern, environment = LIGHTS[lights]
     real = "display" in lights
-    device = Device(falloff=0.8) if real else None
+    device = Device(falloff=0.8) if real else Device()
     rig = rig or (WIDE if real else Rig())
     return make_scene(rig, pattern, environment, (4.0, 3.0, 5.0), 1.3, scalar, device)
 
