@@ -8,9 +8,12 @@ import re
 from pathlib import Path
 from typing import Any
 
-from benchmarks.common.results import Table
+from benchmarks.common.results import Table, table
+from invrender.data.simulate_setup import ranges_table
 from invrender.types import InputError
 
+# Tables that the code holds, by "NAME/TABLE" as `filled` reads it: (header, rows).
+OF_THE_CODE = {"simulate/ranges": ranges_table}
 RESULTS = Path(__file__).parents[1] / "results"
 BLOCK = re.compile(r"<!-- (table|number): (.*?) -->(.*?)<!-- end -->", re.DOTALL)
 MARK = re.compile(r"<!-- (?:table|number): .*?-->")
@@ -70,7 +73,8 @@ def filled(text: str, folder: Path = RESULTS) -> str:
     """The text with every marked block's content made anew from the results.
 
     ``<!-- table: NAME/TABLE -->`` up to ``<!-- end -->`` holds a table of ``tables``, or with
-    ``NAME/bars`` the bars; ``<!-- number: FORMAT NAME/key/key -->`` a number, inline, for example
+    ``NAME/bars`` the bars, or one of `OF_THE_CODE`; ``<!-- number: FORMAT
+    NAME/key/key -->`` a number, inline, for example
     ``<!-- number: .0% refine/summaries/photographs/network/improved -->``. Raises
     `InputError` for a block that names nothing, or that does not end.
     """
@@ -90,7 +94,9 @@ def filled(text: str, folder: Path = RESULTS) -> str:
             except ValueError:
                 raise InputError(f"{start}: {form!r} is no format of a number") from None
         name, _, which = argument.partition("/")
-        if which == "bars":
+        if argument in OF_THE_CODE:
+            found = table(*OF_THE_CODE[argument]())
+        elif which == "bars":
             found = bars_table(read_results(name, folder)["bars"])
         else:
             found = look_up(f"{name}/tables/{which}", folder)

@@ -30,13 +30,24 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--spp", type=int, default=64, help="path tracer's samples (64)")
     parser.add_argument("--noise", type=float, default=0.005, help="of the sensor (0.005)")
     parser.add_argument("--seed", type=int, default=0, help="of everything random (0)")
+    real = parser.add_argument_group(
+        "real set-ups", "with --device real display, ball, camera and hands are drawn by the seed"
+    )
+    real.add_argument("--device", choices=("ideal", "real"), default="ideal", help="(ideal)")
+    real.add_argument(
+        "--exposures", type=int, choices=(1, 2, 3), help="JPEGs of one or more exposures, not EXR"
+    )
+    real.add_argument("--sheet", action="store_true", help="with the printed capture sheet")
+    real.add_argument("--sphere", action="store_true", help="a whole ball")
+    real.add_argument("--camera-height", type=float, metavar="METRES", help="above the table")
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
     from invrender.data.environments import procedural_environment, read_environment
     from invrender.data.materials import procedural_material, read_material
-    from invrender.data.simulate import simulate
+    from invrender.data.simulate import simulate, simulate_real
+    from invrender.data.simulate_setup import draw_setup
     from invrender.files.images import read_image
     from invrender.files.output import check_output
     from invrender.maps import resize_maps
@@ -47,6 +58,20 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
     if args.size < 1 or args.width < 64 or args.spp < 1:
         raise InputError("sizes and sample counts must be positive, the photo 64 pixels or wider")
+    setup = None
+    if args.device == "real":
+        setup = draw_setup(
+            args.seed,
+            {None: "raw", 1: "jpeg"}.get(args.exposures, "bracket"),
+            exposures=args.exposures or 2,
+            sheet=args.sheet,
+            sphere=args.sphere or None,
+            camera_height=args.camera_height,
+        )
+    elif args.exposures or args.sheet or args.sphere or args.camera_height is not None:
+        raise InputError(
+            "--exposures, --sheet, --sphere and --camera-height belong to --device real"
+        )
     given = [path for path in (args.maps, args.environment, args.pattern) if path]
     check_output(args.out, given, megabytes=20e-6 * args.width**2 + 5)
     if args.maps:
@@ -60,9 +85,13 @@ def run(args: argparse.Namespace, console: Console) -> int:
     environment = scale_environment(environment, args.irradiance)
     pattern = read_image(args.pattern) if args.pattern else default_pattern()
     with console.status("path tracing …"):
-        simulate(
-            args.out, maps, environment, pattern, Rig(),
-            gain=args.gain, width=args.width, spp=args.spp, noise=args.noise, seed=args.seed,
-        )  # fmt: skip
+        quality: dict[str, int] = {"width": args.width, "spp": args.spp, "seed": args.seed}
+        if setup is None:
+            simulate(
+                args.out, maps, environment, pattern, Rig(),
+                gain=args.gain, noise=args.noise, **quality,
+            )  # fmt: skip
+        else:
+            simulate_real(args.out, maps, environment, pattern, setup, **quality)
     console.print(f"wrote {args.out}")
     return 0

@@ -174,9 +174,15 @@ def _number(path: Path, what: str, value: Any, vector: bool) -> float | Vec3:
 
 
 def write_rig(
-    path: Path, rig: Rig, pattern: str = "", sample: str = "", device: Device | None = None
+    path: Path,
+    rig: Rig,
+    pattern: str = "",
+    sample: str = "",
+    device: Device | None = None,
+    leave: frozenset[str] = frozenset(),
 ) -> None:
-    """Write ``rig.toml``. Fields at their default are left out where reading takes the default."""
+    """Write ``rig.toml``. Fields at their default are left out where reading takes the default, and
+    those of ``leave``, which are to be found in the photo."""
     default = Rig()
     sections: dict[str, list[str]] = {}
 
@@ -186,7 +192,7 @@ def write_rig(
     for (section, key), name in _KEYS.items():
         value = getattr(rig, name)
         # What would else be looked for in the photo is always stated.
-        if (
+        if name not in leave and (
             (section, key) in _REQUIRED
             or name in FOUND_IN_PHOTO
             or name == "fov"

@@ -16,7 +16,7 @@ from invrender.render import brdf
 from invrender.render.backend import BACKEND, dr
 from invrender.rig import Rig
 from invrender.sphere import mitsuba_rows
-from invrender.types import Array
+from invrender.types import Array, Vec3
 
 import mitsuba as mi  # isort: skip  (after the back end has chosen its LLVM)
 
@@ -290,6 +290,34 @@ def _lights(
     return lights
 
 
+def _mirror(reflectance: Vec3, alpha: float) -> dict[str, Any]:
+    rough = {"type": "roughconductor", "distribution": "ggx", "alpha": alpha}
+    return {
+        **(rough if alpha > 1e-3 else {"type": "conductor"}),
+        "material": "none",
+        "specular_reflectance": {"type": "rgb", "value": list(reflectance)},
+    }
+
+
+def _paper(
+    reflectance: Array, page: tuple[float, float, float, float], depth: float
+) -> dict[str, Any]:
+    x0, y0, x1, y1 = page
+    e_x, e_y = np.array([x1 - x0, 0, 0]), np.array([0, y1 - y0, 0])
+    middle = np.array([(x0 + x1) / 2, (y0 + y1) / 2, -depth])
+    image = np.repeat(reflectance[::-1, :, None], 3, -1)  # Mitsuba's row 0 is at -y
+    return {
+        "type": "rectangle",
+        "to_world": _transform([e_x / 2, e_y / 2, np.array([0, 0, 1.0]), middle]),
+        "bsdf": {
+            "type": "diffuse",
+            "reflectance": {
+                "type": "bitmap", "bitmap": _bitmap(image), "raw": True, "wrap_mode": "clamp",
+            },
+        },
+    }  # fmt: skip
+
+
 def _black_rectangle(corner: Array, e_x: Array, e_y: Array) -> dict[str, Any]:
     """Facing down. Mitsuba's rectangle has image row 0 at its -y; turned over, that is +e_y."""
     down = np.cross(e_y, e_x)
@@ -332,8 +360,16 @@ def photograph(
     table: Any = 0.3,
     seed: int = 0,
     device: Device = IDEAL,
+    ball: Vec3 | None = None,
+    ball_alpha: float = 0.0,
+    cover: tuple[Array, tuple[float, float, float, float]] | None = None,
 ) -> Array:
-    """The whole photo (H, W, 3), linear: sample, mirror ball, diffuse table, light between them."""
+    """The whole photo (H, W, 3), linear: sample, mirror ball, diffuse table, light between them.
+
+    ball: its centre where it is not the rig's; ball_alpha: its roughness. cover: what lies on the
+    table under the sample, its reflectance (h, w), row 0 at +y, and its least x, least y, greatest
+    x and greatest y.
+    """
     half, size = rig.sample_size / 2, max(rig.screen_sides)
     camera, (right, up, back) = rig.camera, rig.camera_axes
     table = np.broadcast_to(np.asarray(table, dtype=float), 3)
@@ -373,14 +409,11 @@ def photograph(
             },
             "ball": {
                 "type": "sphere",
-                "center": list(map(float, rig.ball_centre)),
+                "center": list(map(float, rig.ball_centre if ball is None else ball)),
                 "radius": rig.ball_radius,
-                "bsdf": {
-                    "type": "conductor",
-                    "material": "none",
-                    "specular_reflectance": {"type": "rgb", "value": list(rig.ball_reflectance)},
-                },
+                "bsdf": _mirror(rig.ball_reflectance, ball_alpha),
             },
+            **({} if cover is None else {"cover": _paper(*cover, SAMPLE_LIFT * size / 2)}),
             **_lights(rig, pattern, environment, gain, device),
         }
     )
