@@ -85,7 +85,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     environment = scale_environment(environment, args.irradiance)
     pattern = read_image(args.pattern) if args.pattern else default_pattern()
     with console.status("path tracing …"):
-        quality: dict[str, int] = {"width": args.width, "spp": args.spp, "seed": args.seed}
+        quality: dict[str, Any] = {"width": args.width, "spp": args.spp, "seed": args.seed}
         if setup is None:
             simulate(
                 args.out, maps, environment, pattern, Rig(),
