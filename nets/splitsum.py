@@ -21,8 +21,8 @@ import torch
 import torch.nn.functional as F
 from kornia.geometry.transform import remap
 from numpy.typing import NDArray
+from scipy import fft
 from scipy.ndimage import map_coordinates
-from scipy.signal import fftconvolve
 from torch import Tensor
 
 from invrender.rig import Rig
@@ -152,9 +152,18 @@ def prefilter_screen(
     image = np.zeros((size, size, 3))
     image[start : start + pixels, start : start + pixels] = area_resize(pattern, pixels)
     kernels = [_screen_kernel(r, round(height, 2)) for r in roughness]
-    return np.stack(
-        [np.maximum(fftconvolve(image, k[..., None], "same", axes=(0, 1)), 0) for k in kernels]
-    ).astype(np.float32)
+    return np.stack([np.maximum(_convolve(image, k), 0) for k in kernels]).astype(np.float32)
+
+
+def _convolve(image: Array, kernel: Array) -> Array:
+    """The part of image (H, W, C) ∗ kernel (h, w) that lies on the image; scipy.signal's
+    fftconvolve does the same, but its import takes a second."""
+    (h, w), (kh, kw) = image.shape[:2], kernel.shape
+    size = [fft.next_fast_len(a + b - 1, real=True) for a, b in ((h, kh), (w, kw))]
+    product = fft.rfft2(image, size, axes=(0, 1)) * fft.rfft2(kernel, size)[..., None]
+    full = fft.irfft2(product, size, axes=(0, 1))
+    top, left = (kh - 1) // 2, (kw - 1) // 2
+    return np.asarray(full[top : top + h, left : left + w])
 
 
 def area_resize(image: Array, size: int) -> Array:
