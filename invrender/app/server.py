@@ -48,12 +48,12 @@ HEARTBEAT = 15.0  # seconds between signs of life to a page
 # Files of a capture that the page may see, by the name in the address.
 SHOWN_FILES = {
     **{f"preview_{n}.jpg": f"shown/preview_{n}.jpg"
-       for n in ("diffuse", "specular", "roughness", "normal", "render")},
-    **{f"sigma_{n}.jpg": f"shown/sigma_{n}.jpg"
+       for n in ("diffuse", "specular", "roughness", "normal", "render", "lit")},
+    **{f"{k}_{n}.jpg": f"shown/{k}_{n}.jpg" for k in ("map", "sigma")
        for n in ("diffuse", "specular", "roughness", "normal")},
     **{f"{n}.jpg": f"shown/{n}.jpg" for n in ("tile", "repeated", "height")},
     **{f"{n}.png": f"result/{n}.png"
-       for n in ("diffuse", "specular", "roughness", "normal", "photo", "render")},
+       for n in ("photo", "render")},
     "viewer.json": "shown/viewer.json", "report.html": "result/report.html",
     "report.json": "result/report.json",
 }  # fmt: skip

@@ -18,15 +18,15 @@ from PIL import Image
 
 from invrender.app import store
 from invrender.app.corrections import find_corrected_lights, turn_between, turned
-from invrender.capture.lights import FoundLights
 from invrender.capture.orientation import find_ball_and_orientation
 from invrender.colour import linear_to_srgb
 from invrender.files.capture import Capture, load_capture
 from invrender.files.images import Photo
 from invrender.files.write import atomic_path
-from invrender.maps import Maps
+from invrender.maps import Maps, resize_maps
 from invrender.report.inspection import outlines, summary
 from invrender.report.page import SIGMA_TOP, block_means, heat, room_data, to_bytes, viewer_data
+from invrender.rig import Rig
 from invrender.types import Array, InputError
 
 Tell = Callable[[Any], None]
@@ -37,7 +37,8 @@ PREVIEW = 64  # pixels a side of the first, quick maps
 THUMBNAIL = 320  # pixels a side
 TILED = 512  # pixels a side of the previews of a tile and of the relief
 WHITE = 99.0  # percentile of the photo that is drawn white
-SUN = (-0.6, 0.6, 0.53)  # direction to the light in the picture of the relief
+# The lamp of the thumbnail in sample sizes, its power, and the light from everywhere; by eye.
+LAMP, LAMP_POWER, AMBIENT = (-0.6, 0.6, 1.2), 1.6, 0.35
 # Share of the whole time at which a stage begins; medians of the bundled capture.
 BEGINS = {
     "lights": 0.02, "preview": 0.15, "crop": 0.3, "read": 0.3, "forward model": 0.35,
@@ -82,7 +83,7 @@ def check(tell: Tell, folder: str, number: int) -> dict[str, Any]:
         if not fix and max(shown.photo.image.shape) > QUICK:
             quick = _quick_look(capture)
             if quick:
-                answer |= quick | _show(np_turned(capture, quick["turn"]), out)
+                answer |= quick | _show(turned(capture, quick["turn"]).photo, out)
                 tell(answer)
         found = find_corrected_lights(capture, fix)
         turn = turn_between(capture.photo, found.capture.photo)
@@ -101,11 +102,6 @@ def check(tell: Tell, folder: str, number: int) -> dict[str, Any]:
     with atomic_path(out / "check.json") as path:
         path.write_text(json.dumps(answer), encoding="utf-8")
     return answer
-
-
-def np_turned(capture: Capture, turn: int) -> Photo:
-    """The photo turned counter-clockwise by quarters."""
-    return turned(capture, turn).photo
 
 
 def _without_paths(text: str, folder: Path) -> str:
@@ -206,10 +202,21 @@ def _preview(maps: Maps, rendering: Array | None, place: Path) -> None:
     if rendering is not None:
         white = max(float(np.percentile(rendering, WHITE)), 1e-12)
         images["render"] = linear_to_srgb(rendering / white)
+        images["lit"] = linear_to_srgb(_lit(maps))
     for name, image in images.items():
         with atomic_path(out / f"preview_{name}.jpg") as path:
             small = Image.fromarray(to_bytes(block_means(image, TILED)))
             small.save(path, "JPEG", quality=90)
+
+
+def _lit(maps: Maps) -> Array:
+    """The maps under a lamp and a little light from everywhere, for a card of the page."""
+    from invrender.render.point_lights import relight
+
+    rig = Rig()
+    small = resize_maps(maps, *(min(n, THUMBNAIL) for n in maps.shape))
+    lamp = np.array([LAMP]) * rig.sample_size
+    return AMBIENT * (small.diffuse + small.specular) + LAMP_POWER * relight(small, rig, lamp)[0]
 
 
 def _display(name: str, encoded: Array) -> Array:
@@ -221,6 +228,11 @@ def _write_views(maps: Maps, sigma: dict[str, Array], environment: Array, out: P
     out.mkdir(exist_ok=True)
     with atomic_path(out / "viewer.json") as path:
         path.write_text(json.dumps(viewer_data(maps, environment)), encoding="utf-8")
+    # Without the tag of a linear PNG, by which a browser would draw data as if it were light.
+    for name, image in maps.encoded().items():
+        with atomic_path(out / f"map_{name}.jpg") as path:
+            shown = Image.fromarray(to_bytes(_display(name, image)))
+            shown.save(path, "JPEG", quality=95, subsampling=0)
     for name, error in sigma.items():
         spread = np.sqrt(np.mean(error**2, -1)) if error.ndim == 3 else error
         with atomic_path(out / f"sigma_{name}.jpg") as path:
@@ -302,6 +314,3 @@ def guide(tell: Tell, rig_toml: str, file: str) -> None:
         rig_file = Path(folder) / "rig.toml"
         rig_file.write_text(rig_toml, encoding="utf-8")
         write_guide(Path(file), read_rig(rig_file).rig)
-
-
-__all__ = ["FoundLights", "check", "export", "guide", "refine", "rooms", "tile", "views", "warm"]

@@ -34,8 +34,8 @@ function steps(now, id) {
   const done = id && captureOf(id)?.report;
   document.getElementById("steps").replaceChildren(now < 0 ? "" : h("ol", {}, STEPS.map((name, i) => {
     const open = i < 3 || (i === 3 && id) || (i === 4 && done);
-    const inside = [h("i", { "aria-hidden": "true" }, String(i + 1)), h("b", {}, name)];
-    const item = open ? h("a", { href: to[i], "aria-current": i === now && "step", "aria-label": `${i + 1}. ${name}` }, inside)
+    const inside = [h("i", {}, String(i + 1)), h("b", {}, name)];
+    const item = open ? h("a", { href: to[i], "aria-current": i === now && "step" }, inside)
       : h("span.off", { "aria-hidden": "true" }, inside);
     return h(i === now ? "li.now" : "li", {}, item);
   })));

@@ -49,7 +49,7 @@ function list() {
 
 function card(c) {
   const first = c.photos.find((p) => p.check?.shown);
-  const source = c.report ? `/captures/${c.id}/preview_render.jpg?${c.report.made}`
+  const source = c.report ? `/captures/${c.id}/preview_lit.jpg?${c.report.made}`
     : first ? `/captures/${c.id}/photos/${first.number}/photo.jpg?${first.check.shown}` : null;
   const words = c.state === "working" && c.progress ? `${WORDS.working}, ${percent(c.progress.share)}` : WORDS[c.state];
   const problem = c.state === "new" && c.photos.some((p) => p.check?.problem);
@@ -58,5 +58,5 @@ function card(c) {
       source ? h("img", { src: source, alt: "", loading: "lazy" }) : h("div.blank"),
       h("div.body", {}, h("b", {}, c.name), h(`span.state.${problem ? "failed" : c.state}`, {}, problem ? "needs a look" : words),
         c.tags.length > 0 && h("div", {}, c.tags.map((t) => h("span.tag", {}, t))))),
-    h("button.more", { type: "button", "aria-label": `Put ${c.name} into the trash`, onclick: () => attempt(() => discard(c)) }, "Discard"));
+    h("button.more", { type: "button", "aria-label": `Discard ${c.name}`, onclick: () => attempt(() => discard(c)) }, "Discard"));
 }

@@ -121,7 +121,7 @@ function relight(panel, c) {
 function flat(panel, c) {
   const shade = h("input", { type: "range", id: "sure", min: 0, max: 1, step: 0.05, value: "0" });
   const all = MAPS.map(([name, title]) => {
-    const source = `/captures/${c.id}/${name}.png?${c.report.made}`;
+    const source = `/captures/${c.id}/map_${name}.jpg?${c.report.made}`;
     const sigma = h("img.sigma", { src: `/captures/${c.id}/sigma_${name}.jpg?${c.report.made}`, alt: "" });
     const loupe = h("div.loupe", { hidden: true });
     loupe.style.backgroundImage = `url("${source}")`;
@@ -140,7 +140,7 @@ function flat(panel, c) {
   shade.addEventListener("input", set);
   set();
   panel.append(h("div.maps2", {}, all.map((m) => m.figure)),
-    h("div.slider", {}, h("label", { for: "sure" }, "Expected error"), shade, h("span")),
+    h("div.slider.wide", {}, h("label", { for: "sure" }, "Expected error"), shade),
     h("p.small.soft", {}, "The slider lays the expected error over each map: dark is certain, bright yellow is ± 0.2 or more, a guess."));
   return null;
 }

@@ -316,6 +316,7 @@ function startViewer(data) {
     if (!gl.getExtension("EXT_color_buffer_float") && !gl.getExtension("EXT_color_buffer_half_float"))
       return fail("The live viewer needs float render targets, which this graphics driver lacks.");
     await load();
+    if (stopped) return;
     resize(1);
     draw();
     slow = frameTime(3) > 33;  // no graphics processor: fewer pixels while something moves
@@ -324,7 +325,7 @@ function startViewer(data) {
     document.documentElement.dataset.viewer = "ready";
   }
 
-  start().catch((error) => fail("The live viewer failed: " + error.message));
+  start().catch((error) => { if (!stopped) fail("The live viewer failed: " + error.message); });
   return { state, canvas, draw, pixels, frameTime, setRoom, redraw, stop };
 }
 
