@@ -29,6 +29,7 @@ from safetensors.numpy import save_file
 
 from invrender.data.environments import find_environments
 from invrender.data.materials import find_materials
+from invrender.device import Device
 from invrender.maps import Maps
 from invrender.refine.lobes import lobe_terms, read_lobes
 from invrender.render.backend import dr
@@ -56,8 +57,10 @@ from nets.training.noise import (
     capture_pattern,
     captured_environment,
     display,
+    draw_devices,
     draw_pattern,
     fit_gain,
+    mirror_error,
     sensor,
 )
 from nets.training.sheet import problems
@@ -74,15 +77,20 @@ def make_group(rng: np.random.Generator, options: Options) -> list[Sample]:
     """``per_room`` captures in one room with one rig. Fewer if some come out degenerate."""
     known, true = draw_rigs(rng)
     pattern = draw_pattern(rng, light_pattern(options.pattern))
-    shown = display(rng, pattern)
+    found, device = draw_devices(rng)
+    shown = display(rng, device.shown(pattern))
+    pattern = found.shown(pattern)
+    # What is left of a display's dimming is in the forward model, all else in the pattern now.
+    found, device = (Device(falloff=d.falloff) for d in (found, device))
     # Irradiance of the room relative to the screen's, from a dark room to a bright one.
     ratio = np.exp(rng.uniform(np.log(0.05), np.log(6.0)))
     level = float(shown.mean()) * 0.7 * ratio  # π times the screen's form factor is about 0.7
     env = scale_environment(draw_environment(rng, options), level)
-    gain = fit_gain(shown, pattern, rng)
-    captured = capture_pattern(rng, shown)
-    seen = captured_environment(rng, env, float(shown.max()))
-    lights = light_inputs(known, pattern, gain, seen, captured)
+    mirror = mirror_error(rng)
+    gain = fit_gain(shown, pattern, rng) * mirror
+    captured = capture_pattern(rng, shown) * mirror
+    seen = captured_environment(rng, env, float(shown.max())) * mirror
+    lights = light_inputs(known, pattern, gain, seen, captured, device=found)
     unit = white_level(lights)
     if not unit > FLOOR:
         return []
@@ -90,8 +98,11 @@ def make_group(rng: np.random.Generator, options: Options) -> list[Sample]:
     size = options.size
     # Light adds up: the room beside a dark screen, and the screen alone as it is and should be.
     room = Fast(make_scene(true, np.ones_like(pattern), env, gain=0.0))
-    screens = [Fast(make_scene(true, p, None, g)) for p, g in ((shown, 1.0), (pattern, gain))]
-    known_lights = Fast(make_scene(known, pattern, seen, gain))
+    screens = [
+        Fast(make_scene(true, p, None, g, device=d))
+        for p, g, d in ((shown, 1.0, device), (pattern, gain, found))
+    ]
+    known_lights = Fast(make_scene(known, pattern, seen, gain, device=found))
     terms = lobe_terms(known_lights, size, size, options.samples)
     out = []
     for _ in range(options.per_room):

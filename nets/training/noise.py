@@ -1,7 +1,8 @@
 """What lies between the light that is meant and what a photo and its mirror ball show of it.
 
-On the screen: intensity, display curve, white balance. On the pattern and the room as the ball
-shows them: mosaic, eroded borders, clipped lamps. On the photo: blur, noise, clipping.
+On the screen: intensity, display curve, white balance, dimming to the sides, mixing. On the pattern
+and the room as the ball shows them: mosaic, eroded borders, clipped lamps, a reflectance that is
+not the mirror's. On the photo: blur, noise, clipping, what is left of a tone curve.
 """
 
 from __future__ import annotations
@@ -9,9 +10,54 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import gaussian_filter, zoom
 
+from invrender.data.simulate_setup import RANGES
+from invrender.device import IDEAL, Device
 from invrender.sphere import resample_environment
 from invrender.types import Array
 from nets.splitsum import area_resize
+
+# Of displays as they are: the share of captures that have one. Standard deviations of what is found
+# of its falloff's exponent, and of each share of its mixing; of the logarithm of the reflectance
+# that a ball is believed to have, and of each channel's; of the shoulder that is left when a JPEG's
+# tone curve is undone. By hand: the estimates' own errors are to be put here when
+# `python -m benchmarks device` has measured them.
+REAL_DISPLAYS = 0.5
+FALLOFF_ERROR, MIXING_ERROR = 0.1, 0.005
+MIRROR_ERROR, MIRROR_TINT = 0.03, 0.01
+TONED, SHOULDER_ERROR = 0.3, 0.05  # the share of photos first
+
+
+def draw_devices(rng: np.random.Generator) -> tuple[Device, Device]:
+    """(the display as the ball showed it, as it really is): dimming and mixing. Its curve, black
+    and white are those of `draw_pattern` and `display`."""
+    if rng.random() >= REAL_DISPLAYS:
+        return IDEAL, IDEAL
+    falloff = rng.uniform(RANGES["falloff"].low, RANGES["falloff"].high)
+    total = rng.uniform(RANGES["mixing"].low, RANGES["mixing"].high, 3)
+    others = 1 - np.eye(3)
+    share = rng.uniform(0, 1, (3, 3)) * others
+    mixing = share / share.sum(1, keepdims=True) * total[:, None]
+    found = np.maximum(mixing + MIXING_ERROR * rng.standard_normal((3, 3)), 0) * others
+    error = FALLOFF_ERROR * rng.standard_normal()
+    return _device(max(falloff + error, 0.0), found), _device(falloff, mixing)
+
+
+def _device(falloff: float, mixing: Array) -> Device:
+    """Of mixing (3, 3) without its diagonal; white stays white."""
+    m = mixing + np.diag(1 - mixing.sum(1))
+    rows = [(float(a), float(b), float(c)) for a, b, c in m]
+    return Device(float(falloff), mixing=(rows[0], rows[1], rows[2]))
+
+
+def mirror_error(rng: np.random.Generator) -> Array:
+    """(3,) factor of all light that the ball shows, where its reflectance is not what is believed.
+
+    Half of the balls are known.
+    """
+    if rng.random() < 0.5:
+        return np.ones(3, np.float32)
+    error = MIRROR_ERROR * rng.standard_normal() + MIRROR_TINT * rng.standard_normal(3)
+    return np.exp(error).astype(np.float32)
 
 
 def draw_pattern(rng: np.random.Generator, pattern: Array) -> Array:
@@ -67,7 +113,7 @@ def captured_environment(rng: np.random.Generator, env: Array, white: float) -> 
 
 
 def sensor(rng: np.random.Generator, image: Array) -> Array:
-    """A camera's noise, blur and clipping on radiance (H, W, 3)."""
+    """A camera's noise, blur, clipping and tone curve on radiance (H, W, 3)."""
     if rng.random() < 0.5:
         image = gaussian_filter(image, (s := rng.uniform(0.2, 0.8), s, 0))
     top = np.percentile(image, 99.5) * np.exp(rng.uniform(np.log(0.8), np.log(8)))
@@ -76,4 +122,8 @@ def sensor(rng: np.random.Generator, image: Array) -> Array:
     read = np.exp(rng.uniform(np.log(2e-4), np.log(2e-3)))
     x = np.clip(image / top, 0, None)
     x = x + np.sqrt(x / electrons + read**2) * rng.standard_normal(image.shape)
-    return (np.clip(x, 0, 1) * top).astype(np.float32)
+    x = np.clip(x, 0, 1)
+    if rng.random() < TONED:
+        k = max(SHOULDER_ERROR * rng.standard_normal(), -0.5)
+        x = (1 + k) * x / (1 + k * x)
+    return (x * top).astype(np.float32)

@@ -11,6 +11,7 @@ torch = pytest.importorskip("torch")
 from safetensors.numpy import load_file, save_file  # noqa: E402
 
 from invrender.data.materials import augment  # noqa: E402
+from invrender.device import IDEAL  # noqa: E402
 from invrender.files.maps import write_maps  # noqa: E402
 from invrender.files.write import write_exr  # noqa: E402
 from invrender.maps import constant_maps  # noqa: E402
@@ -21,7 +22,7 @@ from nets.batch import positions  # noqa: E402
 from nets.model import MAPS  # noqa: E402
 from nets.store import build, load_weights  # noqa: E402
 from nets.training import dataset as data  # noqa: E402
-from nets.training import draw, gpu, sheet, train  # noqa: E402
+from nets.training import draw, gpu, noise, sheet, train  # noqa: E402
 from nets.training.calibrate import calibrate  # noqa: E402
 from nets.training.loader import batches, read_batch, shards  # noqa: E402
 from nets.training.loss import SPREADS, compare, total_loss, truth  # noqa: E402
@@ -249,6 +250,24 @@ def test_display_and_sensor_noise_are_small_and_seeded():
     np.testing.assert_array_equal(a, b)
     assert abs(a.mean() / 0.4 - 1) < 0.25 and a.std() < 0.1
     assert data.capture_pattern(rng, shown).shape == (64, 64, 3)
+
+
+def test_half_of_the_displays_are_real_and_nearly_known():
+    """Found falloff and mixing are those of the display within their errors; white stays white."""
+    rng = np.random.default_rng(0)
+    pairs = [noise.draw_devices(rng) for _ in range(400)]
+    real = [(found, true) for found, true in pairs if true != IDEAL]
+    assert 150 < len(real) < 250 and all(found == IDEAL for found, true in pairs if true == IDEAL)
+    falloff = np.array([[d.falloff for d in pair] for pair in real])
+    assert np.std(np.diff(falloff)) == pytest.approx(noise.FALLOFF_ERROR, rel=0.2)
+    mixing = np.array([[d.mixing for d in pair] for pair in real])
+    np.testing.assert_allclose(mixing.sum(-1), 1, atol=1e-9)
+    assert 0 < np.abs(np.diff(mixing, axis=1)).max() < 6 * noise.MIXING_ERROR
+    white = np.ones((2, 2, 3), np.float32)
+    np.testing.assert_allclose(real[0][1].shown(white), white, rtol=1e-6)
+    mirrors = np.log([noise.mirror_error(rng) for _ in range(400)])
+    assert 150 < (mirrors == 0).all(1).sum() < 250
+    assert np.std(mirrors) < 1.2 * noise.MIRROR_ERROR
 
 
 def test_degenerate_captures_are_named(folder):
