@@ -88,7 +88,7 @@ def measure(shot: Shot, kind: str) -> dict[str, Any]:
         row[name] = float(np.abs(e - t).mean() / t.mean())
     # Where a gamma is fitted the pattern's mean tells the light, whatever the curve.
     light, shown = (
-        (p * g).mean((0, 1)) for p, g in ((lights.pattern, lights.gain), (shot.shown, shot.gain))
+        (p * g).mean((0, 1)) for p, g in ((lights.shown, lights.gain), (shot.shown, shot.gain))
     )
     row["gain"] = float(np.abs(light / shown - 1).mean())
     found = screen_pose(lights.rig, np.asarray(ball.position))

@@ -72,7 +72,7 @@ def measure(shot: Shot) -> dict[str, Any] | None:
     level = photo.clip_level / np.asarray(rig.ball_reflectance)
     x = environment / level
     raised, factor = raise_clipped(
-        photo, rig, image, shot.shown, shot.gain, environment, coverage
+        photo, rig, image, (shot.pattern, shot.gain, shot.device), environment, coverage
     )  # fmt: skip
     results: list[Array] = [
         environment, environment + share * level,

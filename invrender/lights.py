@@ -26,9 +26,9 @@ class Lights:
     What `invrender.find_lights` adds of a photo's mirror ball. coverage: (H, 2H), the share of each
     texel of the environment that the ball really shows, the rest is filled in. pattern_captured:
     (P, P, 3), the screen's radiance as the ball shows it. fit: how well all of it fits, by name:
-    ``residual`` of the pattern relative to the gain, ``gamma`` the exponent on the pattern that
-    fits best (1: as it should be; the gain is for 1), ``blur`` the camera's in pixels, ``pixels``
-    the number used, ``saturated`` and ``room_saturated`` the shares of screen and room in the ball
+    ``residual`` of the pattern relative to the gain, ``gain_deviation`` the standard deviation of
+    the logarithm of the screen's light, ``gamma`` and ``falloff`` the device's, ``blur`` the
+    camera's in pixels, ``pixels`` the number used, ``saturated`` and ``room_saturated`` the shares of screen and room in the ball
     that are saturated, ``room_raised`` how many times brighter the saturated lamps were made,
     ``hidden_lamp`` how many times brighter than the filling a part of the room behind the screen
     was made (1: none), ``pattern_residual`` the residual before the screen's pose and curve were

@@ -24,6 +24,7 @@ from invrender.capture.table import room_irradiance
 from invrender.colour import linear_to_srgb, srgb_to_linear
 from invrender.data.environments import find_environments, procedural_environment, read_environment
 from invrender.data.materials import procedural_material
+from invrender.device import Device
 from invrender.files.images import Photo
 from invrender.maps import Maps, resize_maps
 from invrender.pattern.default import default_pattern
@@ -57,6 +58,7 @@ class Shot:
     environment: Array
     maps: Maps
     sensor: str
+    device: Device
 
 
 def arguments(doc: str | None, count: int, what: str) -> argparse.ArgumentParser:
@@ -140,7 +142,9 @@ def _lookup(image: Array, u: Array, v: Array, wrap: bool = False) -> Array:
     return np.asarray(top * (1 - fv) + (image[i2, j] * (1 - fu) + image[i2, k] * fu) * fv)
 
 
-def incoming(rig: Rig, origin: Array, d: Array, environment: Array, screen: Array) -> Array:
+def incoming(
+    rig: Rig, origin: Array, d: Array, environment: Array, screen: Array, falloff: float = 0.0
+) -> Array:
     """Radiance (n, 3) along upward rays: the screen where they hit it, else the room."""
     h, w = environment.shape[:2]
     u = np.arctan2(d[:, 1], d[:, 0]) / (2 * np.pi) * w % w
@@ -154,15 +158,20 @@ def incoming(rig: Rig, origin: Array, d: Array, environment: Array, screen: Arra
         hit = (t > 0) & (a >= 0) & (a < 1) & (b >= 0) & (b < 1)
     n = len(screen)
     out[hit] = _lookup(screen, a[hit] * n, (1 - b[hit]) * n)
+    if falloff:
+        cosine = np.abs(d[hit] @ normal) / np.linalg.norm(normal)
+        out[hit] *= (cosine**falloff)[:, None]
     return out
 
 
-def table_irradiance(rig: Rig, environment: Array, screen: Array, cells: int = 48) -> Array:
+def table_irradiance(
+    rig: Rig, environment: Array, screen: Array, falloff: float = 0.0, cells: int = 48
+) -> Array:
     """Irradiance (cells, cells, 3) over the table's 0.8 m: the screen, and the room past it."""
     x = ((np.arange(cells) + 0.5) / cells - 0.5) * 0.8
     p = np.stack(np.broadcast_arrays(x[None, :], -x[:, None], 0.0), -1)
     k = 12
-    light = np.einsum("ijkl,klc->ijc", rig.screen_cosines(p, k), resize(screen, k, k))
+    light = np.einsum("ijkl,klc->ijc", rig.screen_cosines(p, k, falloff), resize(screen, k, k))
     room = resample_environment(environment, 64)
     return np.asarray(light + room_irradiance(rig, p.reshape(-1, 3), room).reshape(light.shape))
 
@@ -172,7 +181,7 @@ def table_irradiance(rig: Rig, environment: Array, screen: Array, cells: int = 4
 
 def cast(
     rig: Rig, ball: Array | None, size: tuple[int, int], table: Array, sample: Array,
-    environment: Array, screen: Array, samples: int = 4,
+    environment: Array, screen: Array, samples: int = 4, falloff: float = 0.0,
 ) -> Array:  # fmt: skip
     """Linear photo (H, W, 3). ``table``: radiance of its 0.8 m, ``sample``: of the sample."""
     height, width = size
@@ -206,7 +215,7 @@ def cast(
         m = r - 2 * (r * n).sum(-1, keepdims=True) * n
         up = m[:, 2] > 0
         seen = np.empty_like(p)
-        seen[up] = incoming(rig, p[up], m[up], environment, screen)
+        seen[up] = incoming(rig, p[up], m[up], environment, screen, falloff)
         seen[~up] = ground(p[~up] - m[~up] * (p[~up, 2:] / np.minimum(m[~up, 2:], -1e-9)))
         out[hit] = seen * np.asarray(rig.ball_reflectance)
         return out.reshape(*pixels.shape[:-1], 3)
@@ -230,7 +239,17 @@ def cast(
     return image
 
 
-def sensor(rng: Rng, linear: Array, kind: str, hard: bool) -> tuple[Photo, str]:
+def filmic(x: Array, shoulder: float) -> Array:
+    """A phone's tone curve of linear values: contrast about middle grey, and a shoulder towards
+    white (`shoulder` of 0.6 brings white to two thirds)."""
+    middle, steep = 0.14, 1.25
+    y = middle * np.maximum(x / middle, 0) ** (1 + (steep - 1) * shoulder)
+    return np.asarray(y * (1 + shoulder * middle) / (1 + shoulder * y))
+
+
+def sensor(
+    rng: Rng, linear: Array, kind: str, hard: bool, shoulder: float = 0.0
+) -> tuple[Photo, str]:
     """Blur, noise and file format. kind: "hdr" (float) or "jpeg" (8 bits, clipped)."""
     blur = float(rng.uniform(0, 1.4 if hard else 0.4)) * linear.shape[1] / 1280
     noise = float(rng.uniform(0.002, 0.02 if hard else 0.005))
@@ -244,6 +263,8 @@ def sensor(rng: Rng, linear: Array, kind: str, hard: bool) -> tuple[Photo, str]:
     if kind == "hdr":
         return Photo(image), text
     quality = int(rng.integers(75, 96))
+    if shoulder:
+        image = filmic(image, shoulder)
     data = (linear_to_srgb(image) * 255 + 0.5).astype(np.uint8)
     with io.BytesIO() as file:
         Image.fromarray(data).save(file, "JPEG", quality=quality)
@@ -275,11 +296,12 @@ def hand_held(rng: Rng, rig: Rig, camera: bool, screen: float) -> Rig:
 def make_shot(
     seed: int, *, kind: str = "hdr", hard: bool = True, camera: bool = True, screen: float = 0.5,
     ball: bool = True, display: bool = True, exposure: float = 1.0, width: int = 1280,
-    rooms: Path | None = None,
+    rooms: Path | None = None, device: Device | None = None, shoulder: float = 0.0,
 ) -> Shot:  # fmt: skip
     """One photograph; the same seed gives the same one.
 
-    exposure: of a JPEG; at 1 the screen just fits.
+    exposure: of a JPEG; at 1 the screen just fits. device: of the display, in place of a gamma.
+    shoulder: of a JPEG's tone curve (`filmic`).
     """
     rng = np.random.default_rng(50_000 + seed)
     nominal = Rig(fov=float(rng.uniform(73.7, 80)))
@@ -293,21 +315,22 @@ def make_shot(
     gain = rng.uniform(1.5, 3.0) * rng.uniform(0.8, 1.25, 3)
     pattern = default_pattern(256)
     gamma = float(np.exp(rng.uniform(-1, 1) * np.log(2.2))) if display else 1.0
-    shown = pattern**gamma
+    device = device or Device(gamma=(gamma,) * 3)
+    shown = device.shown(pattern)
     screen_light = np.asarray(shown * gain, np.float32)
     environment = scale_environment(environment, float(rng.uniform(0.1, 1.0) * gain.mean() * 0.3))
     table_kind = TABLES[seed % len(TABLES)]
     clutter = CLUTTER[seed // len(TABLES) % len(CLUTTER)] if hard else "none"
     albedo = table_albedo(rng, table_kind)
     add_clutter(rng, albedo, clutter, nominal)
-    light = table_irradiance(rig, environment, screen_light)
+    light = table_irradiance(rig, environment, screen_light, device.falloff)
     wide = ndimage.zoom(light, (len(albedo) / len(light),) * 2 + (1,), order=1)
     if clutter == "shadow":
         y, x = np.mgrid[: len(wide), : len(wide)] / len(wide) - 0.5
         a, c = rng.uniform(0, 2 * np.pi), rng.uniform(-0.03, 0.1)
         wide *= np.where(x * np.cos(a) + y * np.sin(a) > c, 0.45, 1)[..., None]
     maps = resize_maps(procedural_material(70_000 + seed, 256, 256), 256, 256)
-    sample = Fast(make_scene(rig, shown, environment, gain)).render(maps, 32)
+    sample = Fast(make_scene(rig, pattern, environment, gain, device=device)).render(maps, 32)
     centre = None
     if ball:
         shift = np.clip(rng.normal(0, 2e-3, 2), -5e-3, 5e-3) if camera else np.zeros(2)
@@ -315,7 +338,7 @@ def make_shot(
     size = (width * 3 // 4, width)
     linear = cast(
         rig, centre, size, albedo * wide / np.pi, sample, environment, screen_light,
-        samples=4 if width < 2500 else 2,
+        samples=4 if width < 2500 else 2, falloff=device.falloff,
     )  # fmt: skip
     if (
         centre is not None and hard and rng.uniform() < 0.25
@@ -330,8 +353,8 @@ def make_shot(
     if kind == "jpeg":  # exposed for the screen: what is brighter in the room clips
         scale = np.float32(exposure * rng.uniform(0.7, 0.95) / (0.9 * gain.max()))
         linear, gain, environment = linear * scale, gain * scale, environment * scale
-    photo, how = sensor(rng, linear, kind, hard)
+    photo, how = sensor(rng, linear, kind, hard, shoulder)
     return Shot(
         f"{seed:03d} {table_kind}, {clutter}", photo, nominal, rig, centre, pattern, shown, gain,
-        environment, maps, how,
+        environment, maps, how, device,
     )  # fmt: skip

@@ -16,6 +16,7 @@ from invrender.capture.robust import cauchy_residuals, spread
 from invrender.capture.settings import CLIPPED_LAMPS, TABLE_METER, TINY
 from invrender.capture.table import distant_pairs, lit_table, room_irradiance
 from invrender.colour import AXES
+from invrender.device import Device
 from invrender.files.images import Photo
 from invrender.rig import Rig
 from invrender.types import Array, Mask
@@ -33,12 +34,12 @@ def clipped_share(photo: Photo, rig: Rig, image: BallImage, height: int) -> Arra
 
 
 def raise_clipped(
-    photo: Photo, rig: Rig, image: BallImage, pattern: Array, gain: Array, environment: Array,
-    coverage: Array,
+    photo: Photo, rig: Rig, image: BallImage, screen: tuple[Array, Array, Device],
+    environment: Array, coverage: Array,
 ) -> tuple[Array, float]:  # fmt: skip
     """The environment (H, 2H, 3) with its clipped texels raised; and how many times, the mean.
 
-    The screen's radiance is pattern (h, w, 3) times gain (3,). One factor per channel is found for
+    The screen: pattern (h, w, 3), gain (3,) and display. One factor per channel is found for
     all clipped texels, the most probable one under a log-normal prior and a Lambertian table: the
     logarithms of its radiance some way apart are compared, robustly (Cauchy), since textures,
     papers and shadows have edges, and colour apart from brightness, which varies more. That the
@@ -50,7 +51,7 @@ def raise_clipped(
     assert photo.clip_level is not None
     extra = np.asarray(share * photo.clip_level / np.asarray(rig.ball_reflectance), np.float32)
     filled = fill_environment(environment, coverage)
-    seen, at, use, known = lit_table(photo, rig, image.ball, pattern, gain, filled)
+    seen, at, use, known = lit_table(photo, rig, image.ball, screen, filled)
     factor = np.exp(_excess(seen, use, known, room_irradiance(rig, at, extra)))
     raised = environment + extra * (factor - 1).astype(np.float32)
     return np.asarray(raised, np.float32), float(factor.mean())

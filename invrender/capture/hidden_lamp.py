@@ -18,6 +18,7 @@ from invrender.capture.robust import cauchy_residuals, spread
 from invrender.capture.settings import HIDDEN_LAMP, TABLE_METER, TINY
 from invrender.capture.table import distant_pairs, hidden_by_screen, lit_table
 from invrender.colour import AXES
+from invrender.device import Device
 from invrender.files.images import Photo
 from invrender.rig import Rig
 from invrender.sphere import directions, sky_flux
@@ -25,13 +26,13 @@ from invrender.types import Array, Mask
 
 
 def add_hidden_lamp(
-    photo: Photo, rig: Rig, ball: Ball, pattern: Array, gain: Array, environment: Array,
-    coverage: Array,
+    photo: Photo, rig: Rig, ball: Ball, screen: tuple[Array, Array, Device],
+    environment: Array, coverage: Array,
 ) -> tuple[Array, float]:  # fmt: skip
     """The filled environment (H, 2H, 3) with the lamp behind the screen that the table's shading
     shows; and how many times as bright as the filling that is (1 where there is none).
 
-    The screen's radiance is pattern (h, w, 3) times gain (3,). In a JPEG no lamp is looked for: its
+    The screen: pattern (h, w, 3), gain (3,) and display. In a JPEG no lamp is looked for: its
     colours are too coarse.
     """
     if photo.clip_level is not None:
@@ -41,7 +42,7 @@ def add_hidden_lamp(
     s, t, _ = screen_coordinates(rig, np.asarray(ball.position), d)
     row, column = (np.clip(np.nan_to_num(a) * parts, 0, parts - 1).astype(int) for a in (t, s))
     part = np.where((coverage <= 0) & (d[..., 2] > 0), row * parts + column, -1)
-    seen, at, use, known = lit_table(photo, rig, ball, pattern, gain, environment)
+    seen, at, use, known = lit_table(photo, rig, ball, screen, environment)
     shading = _Shading(seen, use, known)
     best = None
     for k, light in enumerate(_part_lights(rig, at, environment, part)):

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
-from invrender.capture.ball import agrees, find_fov
+from invrender.capture.ball import agrees, find_fov, measure_reflectance
 from invrender.capture.ball_image import BallImage, trace_image, unfold_pattern
 from invrender.capture.camera import find_camera
 from invrender.capture.clipped_lamps import raise_clipped
@@ -19,6 +19,7 @@ from invrender.capture.glare import remove_glare
 from invrender.capture.hidden_lamp import add_hidden_lamp
 from invrender.capture.mirror import Ball
 from invrender.capture.orientation import find_ball_and_orientation, not_the_pattern
+from invrender.capture.response import Response
 from invrender.capture.screen import Screen, fit_screen
 from invrender.capture.settings import PATTERN_CHECK, SCREEN_FIT, TABLE_LEVEL, UNFOLDING
 from invrender.files.capture import Capture
@@ -26,6 +27,11 @@ from invrender.files.images import Photo
 from invrender.lights import Lights
 from invrender.rig import Rig
 from invrender.types import Array, InputError, Notice
+
+CURVE_TEXT = (
+    "the photo has a tone curve, as phones give it to a JPEG; it was undone by what the ball shows "
+    "of the pattern: a raw photo needs no such guess"
+)
 
 
 @dataclass(frozen=True)
@@ -72,8 +78,15 @@ def find_lights(
         if capture.fov_from == "unknown":
             capture, fov_notices = measure_fov(capture, ball)
         capture, found, turned = find_ball_and_orientation(capture, ball)
-        capture, mirror = use_reflectance(capture, found)
-        lights = measure_lights(capture, found)
+        seen = capture
+        capture, mirror = use_reflectance(seen, found)
+        lights, response = _measure(capture, found)
+        if response is not None:
+            seen = replace(seen, photo=response.undo(seen.photo))
+            found = measure_reflectance(seen.photo, seen.rig, found)
+            capture, mirror = use_reflectance(seen, found)
+            lights, _ = _measure(capture, found, curve=False)
+            mirror = (*mirror, Notice("photo-curve", CURVE_TEXT))
     if environment is not None:
         lights = replace(lights, environment=environment)
     if gain is not None:
@@ -128,8 +141,18 @@ def use_reflectance(capture: Capture, ball: Ball) -> tuple[Capture, tuple[Notice
 
 
 def measure_lights(capture: Capture, ball: Ball, height: int = UNFOLDING.height) -> Lights:
-    """Read the lights off the ball: the environment (``height`` rows), the screen's pattern and
-    gain."""
+    """Read the lights off the ball: the environment (``height`` rows), the display and its gain.
+
+    The photo counts as linear: `find_lights` undoes a tone curve before.
+    """
+    return _measure(capture, ball, height, curve=False)[0]
+
+
+def _measure(
+    capture: Capture, ball: Ball, height: int = UNFOLDING.height, *, curve: bool = True
+) -> tuple[Lights, Response | None]:
+    """The lights, and the photo's tone curve where there is one, in which case the lights are not
+    worth much before that is undone."""
     if ball.size != (capture.photo.height, capture.photo.width):
         raise InputError("the ball was found in a photo of another size")
     if height < 8 or height % 2:
@@ -137,8 +160,8 @@ def measure_lights(capture: Capture, ball: Ball, height: int = UNFOLDING.height)
     rig = level_table(capture.photo, capture.rig, ball)
     image = trace_image(rig, ball)
     photo = remove_glare(capture.photo, rig, image)
-    screen = fit_screen(photo, rig, image, capture.pattern)
-    pattern, gain = screen.shown, screen.gain
+    screen = fit_screen(photo, rig, image, capture.pattern, curve=curve)
+    lit = capture.pattern, screen.gain, screen.device
     fit = _fit_numbers(screen, rig)
     if _shows_another_pattern(screen, ball):
         raise not_the_pattern(ball)
@@ -152,16 +175,15 @@ def measure_lights(capture: Capture, ball: Ball, height: int = UNFOLDING.height)
     fit["ball_reflectance_deviation"] = 0.0 if known else ball.reflectance_deviation or 0.0
     fit["room_saturated"] = _room_saturated(photo, rig, image)
     environment, coverage = unfold_environment(photo, rig, image, height, screen.blur)
-    environment, fit["room_raised"] = raise_clipped(
-        photo, rig, image, pattern, gain, environment, coverage
-    )
+    environment, fit["room_raised"] = raise_clipped(photo, rig, image, lit, environment, coverage)
     environment = fill_environment(environment, coverage)
-    environment, fit["hidden_lamp"] = add_hidden_lamp(
-        photo, rig, ball, pattern, gain, environment, coverage
-    )
-    size = min(PATTERN_CHECK.captured_size, max(pattern.shape[:2]))
+    environment, fit["hidden_lamp"] = add_hidden_lamp(photo, rig, ball, lit, environment, coverage)
+    size = min(PATTERN_CHECK.captured_size, max(capture.pattern.shape[:2]))
     captured = unfold_pattern(photo, rig, ball, size)
-    return Lights(rig, pattern, environment, gain, coverage, captured, fit)
+    lights = Lights(
+        rig, capture.pattern, environment, screen.gain, coverage, captured, fit, screen.device
+    )
+    return lights, screen.response
 
 
 def level_table(photo: Photo, rig: Rig, ball: Ball) -> Rig:
@@ -193,7 +215,9 @@ def _fit_numbers(screen: Screen, rig: Rig) -> dict[str, float]:
     return {
         "residual": screen.residual,
         "pattern_residual": screen.ideal_residual,
-        "gamma": float(np.mean(screen.gamma)),
+        "gain_deviation": screen.gain_deviation,
+        "gamma": float(np.mean(screen.device.gamma)),
+        "falloff": screen.device.falloff,
         "blur": screen.blur,
         "pixels": float(screen.pixels),
         "saturated": screen.saturated,

@@ -5,6 +5,10 @@ curve (a gamma a channel), its gain and the camera's blur are fitted together, b
 Marquardt's steps from coarse to fine. Each pixel is compared with what it should average of the
 pattern. Pixels on the screen's edge hold a share of the room beside it; the more, the less certain
 they are. An 8-bit file's colours are blurred more than its luma; how much is fitted.
+
+What else a display does (it dims sideways, its channels mix, its black shines) and the tone curve
+of an 8-bit file are fitted only where the errors ask for them: a score test (Rao 1948) says how
+much they could explain before anything is fitted, and the fit must bear it out.
 """
 
 from __future__ import annotations
@@ -18,8 +22,10 @@ from scipy.spatial.transform import Rotation
 
 from invrender.capture.ball_image import BallImage, screen_coordinates, trace_ball
 from invrender.capture.least_squares import minimise
+from invrender.capture.response import Response, curve_precision, curve_shares
 from invrender.capture.robust import spread as robust_spread
-from invrender.capture.settings import JPEG_GAMMA, JPEG_LUMA, SCREEN_FIT, TINY
+from invrender.capture.settings import DISPLAY, JPEG_GAMMA, JPEG_LUMA, SCREEN_FIT, TINY, TONE_CURVE
+from invrender.device import IDEAL, Device
 from invrender.files.images import Photo
 from invrender.rig import Rig
 from invrender.sampling import resize_pattern
@@ -30,34 +36,39 @@ from invrender.types import Array, InputError
 class Screen:
     """The screen as the ball shows it.
 
-    ``rig``: with the screen's shift and tilt; ``shown`` (h, w, 3): the pattern through the
-    display's curve, ``gamma`` (3,); its radiance is ``gain`` (3,) times that. ``blur`` is the
-    camera's in pixels, ``residual`` the fit's RMS over the mean gain, ``ideal_residual`` that of
-    the screen as it should be, ``deviation`` the standard deviations that the fit expects of the
-    shift (metres) and the tilt (degrees), ``pixels`` the number that lie on the screen and are not
-    saturated, ``saturated`` the share that is.
+    ``rig``: with the screen's shift and tilt; ``device``: what the display makes of the pattern;
+    its radiance is ``gain`` (3,) times that. ``response``: the photo's tone curve, None where it is
+    taken as straight. ``blur`` is the camera's in pixels, ``residual`` the fit's RMS over the mean
+    gain, ``ideal_residual`` that of the screen as it should be, ``deviation`` the standard
+    deviations that the fit expects of the shift (metres) and the tilt (degrees),
+    ``gain_deviation`` that of the logarithm of the screen's light, ``pixels`` the number that lie
+    on the screen and are not saturated, ``saturated`` the share that is.
     """
 
     rig: Rig
-    shown: Array
+    device: Device
     gain: Array
-    gamma: Array
+    response: Response | None
     blur: float
     residual: float
     ideal_residual: float
     deviation: tuple[float, float]
+    gain_deviation: float
     pixels: int
     saturated: float
 
 
-def fit_screen(photo: Photo, rig: Rig, image: BallImage, pattern: Array) -> Screen:
+def fit_screen(
+    photo: Photo, rig: Rig, image: BallImage, pattern: Array, *, curve: bool = True
+) -> Screen:
     """Register the ``pattern`` (h, w, 3), relative radiance, with the ball's image of the screen.
 
     Gain and blur are fitted first, for the screen as it should be. Where that fits worse than to
     `SCREEN_FIT.poor`, or the screen is saturated, its pose and the display's curve are fitted too;
     where more than `SCREEN_FIT.no_curve` is saturated the curve cannot be told from the gain and is
-    taken as straight. Raises `InputError` if the ball cannot show the screen, or shows it saturated
-    or dark.
+    taken as straight. Then what the errors ask for: the display's other properties, and an 8-bit
+    file's tone curve, unless ``curve`` is false. Raises `InputError` if the ball cannot show the
+    screen, or shows it saturated or dark.
     """
     fit = _Fit(photo, rig, image, pattern)
     u = fit.start()
@@ -77,17 +88,23 @@ def fit_screen(photo: Photo, rig: Rig, image: BallImage, pattern: Array) -> Scre
         if better:
             break
     # A saturated pixel had at least so much light, which the ideal screen alone may not explain.
-    if better or ideal.saturated > SCREEN_FIT.saturated:
-        return replace(fit.result(u), ideal_residual=ideal.residual)
-    return ideal
+    if not better and ideal.saturated <= SCREEN_FIT.saturated:
+        return ideal
+    if ideal.saturated < SCREEN_FIT.no_curve:
+        u = fit.explain(u, curve)
+    return replace(fit.result(u), ideal_residual=ideal.residual)
 
 
 # Places of the unknowns: shift and tilt in units of their priors, log gamma and log gain a channel,
-# log blur in pixels, and the log of the further blur of an 8-bit file's colours.
-_SHIFT, _TILT, _GAMMA, _GAIN, _BLUR, _COLOUR = (
-    slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), 12, 13,
+# log blur in pixels, the log of the further blur of an 8-bit file's colours; the display's falloff,
+# black and mixing (off the diagonal, row by row), and the tone curve's logs: nought if absent.
+_SHIFT, _TILT, _GAMMA, _GAIN, _BLUR, _COLOUR, _FALLOFF, _BLACK, _MIXING, _CURVE = (
+    slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), 12, 13, 14, 15, slice(16, 22),
+    slice(22, 22 + len(TONE_CURVE.knots)),
 )  # fmt: skip
-_COUNT = 14
+_COUNT = _CURVE.stop
+_DEVICE = slice(_FALLOFF, _MIXING.stop)
+_PAIRS = [(i, j) for i in range(3) for j in range(3) if i != j]  # of channels: `_MIXING`
 
 
 def _cover(s: Array) -> tuple[Array, Array]:
@@ -150,10 +167,15 @@ class _Fit:
         area = photo.image[rows, columns]
         h, w = area.shape[0] // step, area.shape[1] // step
         pool = area[: h * step, : w * step].reshape(h, step, w, step, 3)
-        reflectance = np.asarray(rig.ball_reflectance, np.float32)
+        self.reflectance = reflectance = np.asarray(rig.ball_reflectance, np.float32)
         self.observed = pool.mean((1, 3), dtype=float) / reflectance
         self.level = np.full(3, photo.clip_level or np.inf) / reflectance
         self.saturated = pool.max((1, 3)) / reflectance >= self.level
+        if self.coded:  # half the resolution of colours leaves errors: they are compared pooled
+            encoded = np.maximum(self.observed, 0) ** (1 / JPEG_GAMMA)
+            luma = (encoded @ np.array(JPEG_LUMA))[..., None]
+            colours = _blur(encoded - luma, SCREEN_FIT.colour_pooling)
+            self.observed = np.maximum(luma + colours, 0) ** JPEG_GAMMA
         # Mirrored rays of the sub-pixels (h, w, n, n) as lines in space, moment and direction
         # (Plücker): where one meets a plane is a fraction of linear forms in it.
         at = (np.arange(n) + 0.5) * step / n
@@ -168,13 +190,21 @@ class _Fit:
         self.prior_mean = np.zeros(_COUNT)
         self.prior_mean[_BLUR] = math.log(SCREEN_FIT.expected_blur)
         self.prior_mean[_COLOUR] = math.log(SCREEN_FIT.colour_blur / step)
-        blurs = np.full(2, 1 / SCREEN_FIT.blur_deviation**2)
-        self.prior = np.diag([*np.ones(6), *np.zeros(6), *blurs])
-        apart = np.eye(3) - 1 / 3
-        self.prior[_GAMMA, _GAMMA] = (
-            apart / SCREEN_FIT.channel_deviation**2 + 1 / 9 / SCREEN_FIT.gamma_deviation**2
-        )
+        self.prior = np.zeros((_COUNT, _COUNT))
+        deviations = np.full(_COUNT, math.inf)
+        deviations[:6] = 1
+        deviations[[_BLUR, _COLOUR]] = SCREEN_FIT.blur_deviation
+        deviations[[_FALLOFF, _BLACK]] = DISPLAY.falloff_deviation, DISPLAY.black_deviation
+        deviations[_MIXING] = DISPLAY.mixing_deviation
+        np.fill_diagonal(self.prior, 1 / deviations**2)
+        self.prior[_CURVE, _CURVE] = curve_precision()
+        self.set_gamma_prior(SCREEN_FIT.gamma_deviation)
         self.focus(0.0)
+
+    def set_gamma_prior(self, deviation: float) -> None:
+        """The deviation of the display's log gamma, of the channels' mean."""
+        apart = np.eye(3) - 1 / 3
+        self.prior[_GAMMA, _GAMMA] = apart / SCREEN_FIT.channel_deviation**2 + 1 / 9 / deviation**2
 
     def focus(self, blurred: float) -> None:
         """Take the image ``blurred`` further for what follows."""
@@ -235,10 +265,12 @@ class _Fit:
         return e_x, e_y, middle - (e_x + e_y) / 2
 
     def look(self, u: Array, slopes: bool = False) -> Array:
-        """What the pixels average of the screen's pattern, and the screen's share: (1, H, W, 4).
+        """What the pixels average of the curved pattern and, last, the screen's share:
+        (1, H, W, 4). Of a display that dims sideways (1, H, W, 5): before the share what the pixels
+        average of white.
 
-        With ``slopes`` their derivatives too, (9, H, W, 4): by shift and tilt, by log gamma, each
-        channel's by its own, and by blur.
+        With ``slopes`` their derivatives too, (n, H, W, ...): by shift and tilt where they are
+        free, by falloff where that is, by log gamma, each channel's by its own, and by blur.
         """
         forms = self.forms(u)
         a, b, c = np.moveaxis(self.lines @ forms, -1, 0)
@@ -254,11 +286,24 @@ class _Fit:
         gamma = np.exp(u[_GAMMA])
         shown = self.pattern**gamma
         light, *by_place = _look_up(shown, s, t, slopes)
-        parts = [np.concatenate([light * cover, cover], -1)]
+        dims = bool(self.free[_FALLOFF] or u[_FALLOFF])
+        white = np.ones_like(cover)
+        if dims:
+            e_x, e_y, _ = self.screen(u)
+            up = np.cross(e_x, e_y)
+            cosine = self.lines[on][..., 3:] @ (up / np.linalg.norm(up))
+            log_cosine = np.log(np.maximum(cosine, SCREEN_FIT.upward[0]))[..., None]
+            white = np.exp(u[_FALLOFF] * log_cosine)
+            light, by_place = light * white, [d * white for d in by_place]
+
+        def stack(light: Array, white: Array, share: Array) -> Array:
+            return np.concatenate([light, white, share] if dims else [light, share], -1)
+
+        parts = [stack(light * cover, white * cover, cover)]
         if slopes:
-            edges = edge_s[on] * cover_t, edge_t[on] * cover_s
+            edges = (e[..., None] for e in (edge_s[on] * cover_t, edge_t[on] * cover_s))
             by_s, by_t = (
-                np.concatenate([d * cover + light * e[..., None], e[..., None]], -1)
+                stack(d * cover + light * e, white * e, e)
                 for d, e in zip(by_place, edges, strict=True)
             )
             if self.free[0]:
@@ -268,15 +313,33 @@ class _Fit:
                 for da, db, dc in np.moveaxis(moved, -1, 0).reshape(6, 3, *s.shape):
                     ds, dt = (((d - q * dc) / c)[..., None] for d, q in ((da, s), (db, t)))
                     parts.append(by_s * ds + by_t * dt)
+            if self.free[_FALLOFF]:
+                by_falloff = log_cosine * cover
+                parts.append(stack(light * by_falloff, white * by_falloff, 0 * cover))
             (curve,) = _look_up(shown * np.log(self.pattern) * gamma, s, t, False)
-            parts.append(np.concatenate([curve * cover, 0 * cover], -1))
-        out = np.zeros((len(parts), *on.shape, 4))
+            parts.append(stack(curve * white * cover, 0 * cover, 0 * cover))
+        out = np.zeros((len(parts), *on.shape, parts[0].shape[-1]))
         for part, image in zip(parts, out, strict=True):
             image[on] = part.mean((1, 2))
         return self.blur(out, u, slopes)
 
+    @staticmethod
+    def mixing(u: Array) -> Array:
+        """How much of each channel appears in each, (3, 3); the rows sum to 1."""
+        mixing = np.eye(3)
+        for (i, j), value in zip(_PAIRS, u[_MIXING], strict=True):
+            mixing[i, j] += value
+            mixing[i, i] -= value
+        return mixing
+
+    def device(self, u: Array) -> Device:
+        """The display that ``u`` describes."""
+        gamma = tuple(np.exp(u[_GAMMA]).tolist()) if self.free[_GAMMA].any() else IDEAL.gamma
+        mixing = tuple(map(tuple, self.mixing(u).tolist()))
+        return Device(float(u[_FALLOFF]), gamma, float(u[_BLACK]), mixing)
+
     def blur(self, out: Array, u: Array, slope: bool) -> Array:
-        """Images (n, H, W, 4) blurred as the camera does; last, if asked for, the slope by that."""
+        """Images (n, H, W, C) blurred as the camera does; last, if asked for, the slope by that."""
         step = SCREEN_FIT.difference
         sigma, wider = (math.hypot(math.exp(u[_BLUR] + d), self.blurred) for d in (0, step))
         blurred = _blur(out, sigma)
@@ -289,7 +352,7 @@ class _Fit:
         """The nominal pose, a straight curve and the gain that fits them best."""
         u = self.prior_mean.copy()
         seen = self.look(u)[0]
-        inside = seen[..., 3] > SCREEN_FIT.inside
+        inside = seen[..., -1] > SCREEN_FIT.inside
         if inside.sum() < SCREEN_FIT.least_inside:
             raise InputError(
                 "the ball's image shows too little of the screen: check the rig's sizes"
@@ -345,14 +408,13 @@ class _Fit:
         """The room behind the screen, the pixels to compare and what to expect of their errors, for
         the screen at ``u``."""
         seen = self.look(u)[0]
-        share = seen[..., 3]
+        share = seen[..., -1]
         self.room, spread = self.background(self.image, share)
         self.use = ndimage.distance_transform_edt(share < SCREEN_FIT.outside) <= SCREEN_FIT.edge
         self.deviation = 1.0
         error = self.errors(u, seen)
-        gain = np.exp(u[_GAIN])
-        level = float(gain.mean())
-        model = seen[..., :3] * gain + (1 - share)[..., None] * self.room
+        level = float(np.exp(u[_GAIN]).mean())
+        model = self.expected(u, seen)
         shot = np.sqrt(level * (model + SCREEN_FIT.dark_noise * level))
         inside = (share > SCREEN_FIT.inside)[..., None] & ~self.clipped
         relative = (error / shot)[inside]
@@ -369,30 +431,50 @@ class _Fit:
         over = np.maximum(error + self.level - self.image, 0)
         return np.asarray(np.where(self.clipped, over, error) / self.deviation)
 
+    def raw(self, u: Array, seen: Array) -> Array:
+        """Relative radiance (..., 3) before the channels mix, or its derivative."""
+        black = u[_BLACK]
+        return np.asarray(seen[..., :3] * (1 - black) + black * seen[..., 3:4])
+
     def expected(self, u: Array, seen: Array) -> Array:
-        """Radiance (H, W, 3) of the pixels."""
-        return np.asarray(seen[..., :3] * np.exp(u[_GAIN]) + (1 - seen[..., 3:]) * self.room)
+        """Radiance (..., H, W, 3) of the pixels; or its derivative by what changes ``seen``."""
+        light = self.raw(u, seen) @ self.mixing(u).T * np.exp(u[_GAIN])
+        room = (1 - seen[..., -1:]) if seen.ndim == 3 else -seen[..., -1:]
+        return np.asarray(light + room * self.room)
 
     def code(self, u: Array, model: Array, slopes: Array | None = None) -> Array:
         """Radiance (H, W, 3) as an 8-bit file has it; or (n, H, W, 3), the ``slopes`` as that
         changes them.
 
-        A JPEG's colours, differences to luma, all three through a display's curve, are blurred.
+        The camera's tone curve comes first. A JPEG's colours, differences to luma, all three
+        through a display's curve, are blurred.
         """
         if not self.coded:
             return model if slopes is None else slopes
-
-        def mix(image: Array) -> Array:
-            luma = (image @ np.array(JPEG_LUMA))[..., None]
-            return np.asarray(luma + _blur(image - luma, math.exp(u[_COLOUR])))
-
-        linear, encoded = SCREEN_FIT.least_radiance
-        model = np.maximum(model, linear)
-        mixed = np.maximum(mix(model ** (1 / JPEG_GAMMA)), encoded)
+        if self.free[_CURVE].any():
+            curved, steep = self.curved(u, model)
+            if slopes is not None:
+                slopes = slopes * (steep * curved / np.maximum(model, TINY))
+            model = curved
+        model = np.maximum(model, SCREEN_FIT.least_radiance[0])
+        mixed = self.blur_colours(u, model ** (1 / JPEG_GAMMA))
+        mixed = np.maximum(mixed, SCREEN_FIT.least_radiance[1])
         if slopes is None:
             return np.asarray(mixed**JPEG_GAMMA)
-        by_code = mix(slopes * model ** (1 / JPEG_GAMMA - 1))
+        by_code = self.blur_colours(u, slopes * model ** (1 / JPEG_GAMMA - 1))
         return np.asarray(by_code * mixed ** (JPEG_GAMMA - 1))
+
+    def curved(self, u: Array, model: Array) -> tuple[Array, Array]:
+        """Radiance (H, W, 3) after the camera's tone curve, and how steep that is there."""
+        value, steep = Response(tuple(u[_CURVE])).apply(model * self.reflectance)
+        return value / self.reflectance, steep
+
+    @staticmethod
+    def blur_colours(u: Array, image: Array) -> Array:
+        """Encoded images (..., H, W, 3) with their colours blurred as ``u`` says."""
+        luma = (image @ np.array(JPEG_LUMA))[..., None]
+        sigma = math.hypot(math.exp(u[_COLOUR]), SCREEN_FIT.colour_pooling)
+        return np.asarray(luma + _blur(image - luma, sigma))
 
     def cost(self, u: Array) -> float:
         """Cauchy's loss of the errors and half the prior's square; infinite for no possible rig."""
@@ -409,21 +491,30 @@ class _Fit:
         """Gauss–Newton's matrix and right side for the free unknowns, with Cauchy's weights."""
         seen, *slopes = self.look(u, True)
         r = self.errors(u, seen)[self.use]
-        gain = np.exp(u[_GAIN])
         model = self.expected(u, seen)
         by = np.zeros((_COUNT, *model.shape))
-        places = [*range(6), _BLUR] if self.free[0] else [_BLUR]
-        for k, d in zip(places, [*slopes[:-2], slopes[-1]], strict=True):
-            by[k] = d[..., :3] * gain - d[..., 3:] * self.room
+        *places, curves, blurs = slopes
+        known = [*range(6)] * bool(self.free[0]) + [_FALLOFF] * bool(self.free[_FALLOFF]) + [_BLUR]
+        by[known] = self.expected(u, np.stack([*places, blurs]))
+        gain, mixing, light = np.exp(u[_GAIN]), self.mixing(u), self.raw(u, seen)
         for c in range(3):
-            by[6 + c, ..., c] = slopes[-2][..., c] * gain[c]
-            by[9 + c, ..., c] = seen[..., c] * gain[c]
-        by = self.code(u, model, by)
+            by[6 + c] = curves[..., c : c + 1] * (1 - u[_BLACK]) * mixing[:, c] * gain
+            by[9 + c, ..., c] = light @ mixing[c] * gain[c]
+        if self.free[_DEVICE].any():
+            by[_BLACK] = (seen[..., 3:4] - seen[..., :3]) @ mixing.T * gain
+            for k, (i, j) in enumerate(_PAIRS):
+                by[_MIXING.start + k, ..., i] = gain[i] * (light[..., j] - light[..., i])
+        if self.free[_CURVE].any():
+            _, steep = self.curved(u, model)
+            shares = curve_shares(model * self.reflectance)
+            by[_CURVE] = np.moveaxis(shares, -1, 0) * (model / steep)
+        by = self.code(u, model, by[self.free])
         if self.coded:
             step = SCREEN_FIT.difference
             more = u + step * (np.arange(_COUNT) == _COLOUR)
-            by[_COLOUR] = (self.code(more, model) - self.code(u, model)) / step
-        jacobian = np.moveaxis(by[self.free] / self.deviation, 0, -1)[self.use]
+            change = (self.code(more, model) - self.code(u, model)) / step
+            by[np.count_nonzero(self.free[:_COLOUR])] = change
+        jacobian = np.moveaxis(by / self.deviation, 0, -1)[self.use]
         jacobian[self.clipped[self.use] & (r == 0)] = 0
         j = jacobian.reshape(r.size, -1)
         weighted = j / (1 + (r.reshape(-1, 1) / SCREEN_FIT.robust) ** 2)
@@ -438,23 +529,73 @@ class _Fit:
         weight = np.minimum(1, 2 * np.median(error, 0) / np.maximum(error, TINY))
         return float(np.sqrt(((weight * error**2).sum(0) / weight.sum(0)).mean()))
 
+    def explain(self, u: Array, curve: bool) -> Array:
+        """The fit from ``u`` on with those of the display's other properties, and of the file's
+        tone curve, that the errors ask for, one after the other."""
+        blocks = [_DEVICE] + [_CURVE] * (curve and self.coded)
+        while blocks:
+            tests = [self.score(u, block) for block in blocks]
+            block = blocks.pop(int(np.argmax(tests)))
+            if max(tests) < self.least_gain(u):
+                break
+            tried = self.with_block(u, block)
+            gained, needed = self.cost(u) - self.cost(tried), self.least_gain(tried)
+            no_curve = block == _CURVE and not Response(tuple(tried[_CURVE])).is_likely
+            if gained < needed or no_curve:
+                self.drop(block)
+                self.prepare(u)
+            else:
+                u = tried
+        return u
+
+    def least_gain(self, u: Array) -> float:
+        """By how much the cost must fall for further unknowns to be believed."""
+        return max(SCREEN_FIT.better, DISPLAY.least_gain * self.cost(u))
+
+    def with_block(self, u: Array, block: slice) -> Array:
+        """The fit from ``u`` on with a further block of unknowns."""
+        self.free[block] = True
+        if block == _CURVE:  # a display's gamma and a camera's power look alike
+            self.set_gamma_prior(DISPLAY.gamma_deviation)
+        for stage in SCREEN_FIT.stages[-2:]:
+            u = self.solve(u, *stage)
+        place = np.arange(_COUNT)
+        device = (place >= _DEVICE.start) & (place < _DEVICE.stop)
+        while (device & (u < 0)).any():  # no display has that: it has none of it
+            self.free &= ~(device & (u < 0))
+            u = self.solve(np.where(device, np.maximum(u, 0), u), *SCREEN_FIT.stages[-1])
+        return u
+
+    def drop(self, block: slice) -> None:
+        """Fit a block of unknowns no more."""
+        self.free[block] = False
+        if block == _CURVE:
+            self.set_gamma_prior(SCREEN_FIT.gamma_deviation)
+
+    def score(self, u: Array, block: slice) -> float:
+        """By how much the cost may fall with a block of unknowns, by its slope and curvature."""
+        was = self.free.copy()
+        self.free[block] = True
+        matrix, right = self.normal_equations(u)
+        self.free = was
+        return float(right @ np.linalg.solve(matrix, right)) / 2
+
     def result(self, u: Array) -> Screen:
-        """What the fit says, with the pattern through the display's curve."""
-        gamma, gain = np.exp(u[_GAMMA]), np.exp(u[_GAIN])
+        """What the fit says."""
+        gain, device = np.exp(u[_GAIN]), self.device(u)
         seen = self.look(u)[0]
-        inside = seen[..., 3] > SCREEN_FIT.inside
+        inside = seen[..., -1] > SCREEN_FIT.inside
         unclipped = inside & ~self.clipped.any(-1)
         error = np.abs(self.errors(u, seen) * self.deviation)
         residual = self.residual(error[unclipped]) / float(gain.mean())
-        spread = np.zeros(6)
-        if self.free[0]:
-            spread = np.sqrt(np.diag(np.linalg.inv(self.normal_equations(u)[0]))[:6])
+        covariance = self.covariance(u)
+        spread = np.sqrt(np.diag(covariance)[:6])
         shift = SCREEN_FIT.shift_deviation * self.rig.sample_size
         return Screen(
             rig=self.moved(u),
-            shown=np.maximum(self.full, 0) ** gamma,
+            device=device,
             gain=gain,
-            gamma=gamma,
+            response=Response(tuple(u[_CURVE].tolist())) if self.free[_CURVE].any() else None,
             blur=math.exp(u[_BLUR]) * self.step,
             residual=residual,
             ideal_residual=residual,
@@ -462,6 +603,29 @@ class _Fit:
                 float(np.linalg.norm(spread[:3])) * shift,
                 float(np.linalg.norm(spread[3:])) * SCREEN_FIT.tilt_deviation,
             ),
+            gain_deviation=self.gain_deviation(u, covariance),
             pixels=int(unclipped.sum()) * self.step**2,
             saturated=float(1 - unclipped.sum() / max(inside.sum(), 1)),
         )
+
+    def covariance(self, u: Array) -> Array:
+        """That of all unknowns, nought for those that are known. The display's curve counts as
+        unknown even where it could not be fitted, and so does that of an 8-bit file."""
+        was = self.free.copy()
+        if self.free[0]:
+            if self.coded or not self.free[_GAMMA].any():
+                self.set_gamma_prior(DISPLAY.gamma_deviation)
+            self.free[_GAMMA], self.free[_CURVE] = True, self.coded
+        out = np.zeros((_COUNT, _COUNT))
+        out[np.ix_(self.free, self.free)] = np.linalg.inv(self.normal_equations(u)[0])
+        self.free = was
+        return out
+
+    def gain_deviation(self, u: Array, covariance: Array) -> float:
+        """Standard deviation of the logarithm of the screen's light, the channels' mean."""
+        shown = self.pattern ** np.exp(u[_GAMMA])
+        by = np.zeros(_COUNT)
+        by[_GAIN] = 1 / 3
+        log = np.log(self.pattern) * np.exp(u[_GAMMA])
+        by[_GAMMA] = (shown * log).mean((0, 1)) / shown.mean((0, 1)) / 3
+        return float(np.sqrt(by @ covariance @ by)) * SCREEN_FIT.correlated

@@ -289,6 +289,7 @@ class ScreenFit:
     expected_blur: float = 0.5  # pixels; by hand
     blur_deviation: float = 0.7  # of the blurs' logarithms; by hand
     colour_blur: float = 0.9  # pixels, of colours in a JPEG at half the resolution; by hand
+    colour_pooling: float = 1.5  # pixels, of the colours in photo and model alike; by hand
     finest: float = 100.0  # pixels; a larger ball is shrunk for the fit; by hand
     cells: int = 128  # of the pattern in the fit, a side; by hand
     poor: float = 0.01  # residual from which the nominal screen is in doubt; by hand
@@ -330,6 +331,39 @@ class ScreenFit:
     last_cell: float = 1.001  # cells from the pattern's border in a look-up; by hand
     longest_step: float = 0.5  # of the unknowns; by hand
     steps: int = 60  # at most; by hand
+    correlated: float = 3.0  # by which neighbours' like errors raise the gain's deviation; by hand
+
+
+@dataclass(frozen=True)
+class Display:
+    """What displays are like beyond a gamma, where the errors ask for it:
+    `invrender.capture.screen`. Deviations about nought."""
+
+    falloff_deviation: float = 1.0  # of the exponent; measured displays have 0.3 to 1.6
+    black_deviation: float = 0.01  # relative to white; by hand
+    mixing_deviation: float = 0.05  # of a channel's light in another; measured: 0.01 to 0.09
+    # Of the logarithm of the display's gamma, where the file's tone curve is fitted beside it;
+    # measured displays have gammas of 0.92 to 1.12.
+    gamma_deviation: float = 0.05
+    least_gain: float = 0.04  # of the cost, that further unknowns must explain; by hand
+
+
+@dataclass(frozen=True)
+class ToneCurve:
+    """The tone curve of an 8-bit file: `invrender.capture.response`."""
+
+    knots: tuple[float, ...] = (0.004, 0.015, 0.05, 0.14, 0.3, 0.55, 0.85, 1.3, 2.5)  # by hand
+    fixed: int = 3  # the knot that stays as it is: about middle grey
+    white: int = 6  # the knot nearest to white
+    # Of that knot's logarithm, at most: a camera's curve flattens there. Of eight straight files
+    # the fit's was -0.09 at least, of twelve curved ones -0.15 at most.
+    shoulder: float = -0.12
+    fixed_deviation: float = 1e-3  # of its logarithm; by hand
+    slope_deviation: float = 0.5  # of the curve's slope about 1; by hand
+    bend_deviation: float = 0.4  # of the slope's change from knot to knot; by hand
+    darkest: float = 1e-6  # linear; by hand
+    least_slope: float = 0.1  # of the whole curve, in logarithms, that can be undone; by hand
+    parts: int = 16  # of a photo, one after the other, to save memory; by hand
 
 
 @dataclass(frozen=True)
@@ -440,6 +474,8 @@ CROPPING = Cropping()
 TABLE_LEVEL = TableLevel()
 GLARE_FIT = GlareFit()
 SCREEN_FIT = ScreenFit()
+DISPLAY = Display()
+TONE_CURVE = ToneCurve()
 PATTERN_CHECK = PatternCheck()
 UNFOLDING = Unfolding()
 TABLE_METER = TableMeter()

@@ -8,6 +8,7 @@ import numpy as np
 
 from invrender.capture.mirror import Ball
 from invrender.capture.settings import TABLE_METER
+from invrender.device import Device
 from invrender.files.images import Photo
 from invrender.rig import Rig
 from invrender.sampling import resize_pattern
@@ -16,18 +17,20 @@ from invrender.types import Array, Mask
 
 
 def lit_table(
-    photo: Photo, rig: Rig, ball: Ball, pattern: Array, gain: Array, environment: Array
+    photo: Photo, rig: Rig, ball: Ball, screen: tuple[Array, Array, Device], environment: Array
 ) -> tuple[Array, Array, Mask, Array]:
     """The blocks that show the table: log radiance (n, 3), points (n, 3), which those are (h, w),
-    and their irradiance (n, 3) from the screen and the filled environment."""
+    and their irradiance (n, 3) from the screen (pattern, gain, display) and the filled
+    environment."""
     seen, points, use = table_blocks(photo, rig, ball)
     at = points[use]
     count = TABLE_METER.screen_cells
-    cells = resize_pattern(pattern, count) * gain
-    screen = np.einsum("nij,ijc->nc", rig.screen_cosines(at, count), cells)
+    pattern, gain, device = screen
+    cells = resize_pattern(device.shown(pattern), count) * gain
+    lit = np.einsum("nij,ijc->nc", rig.screen_cosines(at, count, device.falloff), cells)
     rows = TABLE_METER.environment_rows
     room = room_irradiance(rig, at, resample_environment(environment, rows))
-    return np.log(seen[use]), at, use, screen + room
+    return np.log(seen[use]), at, use, lit + room
 
 
 def table_blocks(photo: Photo, rig: Rig, ball: Ball) -> tuple[Array, Array, Mask]:

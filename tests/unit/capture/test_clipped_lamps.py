@@ -13,6 +13,7 @@ from invrender.capture.environment import fill_environment, unfold_environment
 from invrender.capture.hidden_lamp import add_hidden_lamp
 from invrender.capture.mirror import make_ball
 from invrender.capture.table import hidden_by_screen, room_irradiance
+from invrender.device import IDEAL
 from invrender.files.images import Photo
 from invrender.rig import Rig
 from invrender.sphere import directions, irradiance, solid_angles
@@ -21,6 +22,7 @@ RIG, SIZE = Rig(), (480, 640)
 BALL = make_ball(RIG, RIG.ball_centre, RIG.ball_radius, SIZE)
 IMAGE = trace_image(RIG, BALL)
 PATTERN, GAIN = blocks(), np.array([0.8, 0.85, 0.75])
+SCREEN = PATTERN, GAIN, IDEAL
 TILTED = [(0.6, 0, 0.8), (-0.6, 0, 0.8), (0, 0.6, 0.8), (0, -0.6, 0.8)]
 LEVEL = 0.95
 
@@ -77,7 +79,7 @@ def picture(light, albedo, room=room):
 def test_the_table_tells_how_bright_clipped_lamps_are(light, albedo):
     photo, environment, coverage = picture(light, albedo)
     truth = room(directions(256, 512).astype(float))
-    raised, factor = raise_clipped(photo, RIG, IMAGE, PATTERN, GAIN, environment, coverage)
+    raised, factor = raise_clipped(photo, RIG, IMAGE, SCREEN, environment, coverage)
 
     def error(seen):
         seen = fill_environment(seen, coverage)
@@ -94,7 +96,7 @@ def test_the_table_tells_how_bright_clipped_lamps_are(light, albedo):
 def test_nothing_clipped_nothing_raised(light):
     photo, environment, coverage = picture(light, grey_table)
     for whole in (replace(photo, clip_level=None), replace(photo, clip_level=2.0)):
-        found = raise_clipped(whole, RIG, IMAGE, PATTERN, GAIN, environment, coverage)
+        found = raise_clipped(whole, RIG, IMAGE, SCREEN, environment, coverage)
         assert found[0] is environment and found[1] == 1
 
 
@@ -102,7 +104,7 @@ def test_the_table_tells_of_a_lamp_behind_the_screen():
     photo, environment, coverage = picture(table_light(hidden_lamp), plain_table, hidden_lamp)
     photo = replace(photo, clip_level=None)
     filled = fill_environment(environment, coverage)
-    found, times = add_hidden_lamp(photo, RIG, BALL, PATTERN, GAIN, filled, coverage)
+    found, times = add_hidden_lamp(photo, RIG, BALL, SCREEN, filled, coverage)
     assert times > 20
     np.testing.assert_array_equal(found[coverage > 0], environment[coverage > 0])
     truth = hidden_lamp(directions(64, 128).astype(float))
@@ -120,7 +122,7 @@ def test_no_lamp_behind_the_screen_where_there_is_none(light, albedo):
     filled = fill_environment(environment, coverage)
     whole = replace(photo, clip_level=None)
     for some in (whole, photo, replace(whole, image=0 * photo.image)):
-        found, times = add_hidden_lamp(some, RIG, BALL, PATTERN, GAIN, filled, coverage)
+        found, times = add_hidden_lamp(some, RIG, BALL, SCREEN, filled, coverage)
         assert found is filled and times == 1
 
 
@@ -132,7 +134,7 @@ def test_a_table_that_says_nothing_leaves_the_prior(table, light):
     image[:, :250] = image[:, 390:] = table
     image[:180] = image[300:] = table
     bad = replace(photo, image=image)
-    raised, factor = raise_clipped(bad, RIG, IMAGE, PATTERN, GAIN, environment, coverage)
+    raised, factor = raise_clipped(bad, RIG, IMAGE, SCREEN, environment, coverage)
     assert np.isfinite(raised).all() and 1 <= factor < 500
 
 

@@ -10,7 +10,7 @@ from synthetic_photo import blocks, photograph
 from invrender.capture import screen
 from invrender.capture.ball_image import trace_image
 from invrender.capture.mirror import make_ball
-from invrender.capture.settings import SCREEN_FIT
+from invrender.capture.settings import SCREEN_FIT, TONE_CURVE
 from invrender.files.images import Photo
 from invrender.rig import Rig
 
@@ -44,14 +44,22 @@ def unknowns(fit, seed=0):
     return u
 
 
-def test_the_slopes_are_those_of_the_cost(hard):
-    fit = screen._Fit(Photo(hard), RIG, IMAGE, blocks())
+@pytest.mark.parametrize("level", [None, 2.5])
+def test_the_slopes_are_those_of_the_cost(hard, level):
+    fit = screen._Fit(Photo(hard, level), RIG, IMAGE, blocks())
     fit.free[:] = True
+    fit.free[screen._COLOUR] = fit.free[screen._CURVE] = level is not None
     u = unknowns(fit)
+    u[screen._DEVICE] = 0.4, 0.01, 0.02, 0.03, 0.01, 0.02, 0.04, 0.03
+    if level:
+        u[screen._CURVE] = np.random.default_rng(1).normal(0, 0.03, len(TONE_CURVE.knots))
     fit.prepare(u)
     _, downhill = fit.normal_equations(u)
-    step = 1e-3 * np.eye(14)
-    slope = np.array([fit.cost(u - d) - fit.cost(u + d) for d in step]) / 2e-3
+    step = 1e-4 * np.eye(len(u))[fit.free]
+    slope = np.array([fit.cost(u - d) - fit.cost(u + d) for d in step]) / 2e-4
+    for part in (slice(9, 12), slice(13, None)):  # gains; what is beyond pose and curve
+        here = slope[part]
+        np.testing.assert_allclose(downhill[part], here, atol=0.03 * np.abs(here).max())
     np.testing.assert_allclose(downhill, slope, atol=0.03 * np.abs(slope).max())
 
 
