@@ -28,12 +28,13 @@ class Lights:
     (P, P, 3), the screen's radiance as the ball shows it. fit: how well all of it fits, by name:
     ``residual`` of the pattern relative to the gain, ``gain_deviation`` the standard deviation of
     the logarithm of the screen's light, ``gamma`` and ``falloff`` the device's, ``blur`` the
-    camera's in pixels, ``pixels`` the number used, ``saturated`` and ``room_saturated`` the shares of screen and room in the ball
-    that are saturated, ``room_raised`` how many times brighter the saturated lamps were made,
-    ``hidden_lamp`` how many times brighter than the filling a part of the room behind the screen
-    was made (1: none), ``pattern_residual`` the residual before the screen's pose and curve were
-    fitted, ``screen_shift`` (metres) and ``screen_tilt`` (degrees) how far the screen is found from
-    its place, ``camera_tilt`` how far the camera is found to look past straight down, in degrees,
+    camera's in pixels, ``pixels`` the number used, ``saturated`` and ``room_saturated`` the shares
+    of screen and room in the ball that are saturated, ``room_raised`` how many times brighter the
+    saturated lamps were made, ``hidden_lamp`` how many times brighter than the filling a part of
+    the room behind the screen was made (1: none), ``pattern_residual`` the residual before the
+    screen's pose and curve were fitted, ``screen_shift`` (metres) and ``screen_tilt`` (degrees) how
+    far the screen is found from its place, ``camera_tilt`` how far the camera is found to look past
+    straight down, in degrees,
     ``ball_reflectance`` the mirror's and ``ball_reflectance_deviation`` the standard deviation of
     its logarithm (0: it was stated), with which all radiance here scales.
 

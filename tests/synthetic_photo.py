@@ -52,7 +52,9 @@ def blocks(count: int = 8, size: int = 64, seed: int = 5) -> Any:
     return np.repeat(np.repeat(colours[chosen], size // count, 0), size // count, 1)
 
 
-def light_from(rig: Rig, origin: Any, d: Any, environment: Shade, pattern: Any, gain: Any) -> Any:
+def light_from(
+    rig: Rig, origin: Any, d: Any, environment: Shade, pattern: Any, gain: Any, falloff: float = 0
+) -> Any:
     """Radiance arriving along upward directions: the screen if it is hit, else the sky."""
     out = environment(d)
     e_x, e_y = rig.screen_edges
@@ -65,6 +67,8 @@ def light_from(rig: Rig, origin: Any, d: Any, environment: Shade, pattern: Any, 
     row = ((1 - b[hit]) * pattern.shape[0]).astype(int).clip(0, pattern.shape[0] - 1)
     column = (a[hit] * pattern.shape[1]).astype(int)
     out[hit] = pattern[row, column] * gain
+    if falloff:
+        out[hit] *= (np.abs(d[hit] @ n) / np.linalg.norm(n))[:, None] ** falloff
     return out
 
 
@@ -84,6 +88,7 @@ def photograph(
     gain: Any = (2.0, 2.1, 1.9),
     ball: Any = (0.0, 0.0),
     samples: int = 4,
+    falloff: float = 0,
 ) -> Any:
     """Linear photo (H, W, 3). ``ball``: its shift on the table in metres; None leaves it out."""
     pattern = blocks() if pattern is None else pattern
@@ -106,7 +111,7 @@ def photograph(
         m = r - 2 * (r * n).sum(-1, keepdims=True) * n
         up = m[:, 2] > 0
         seen = np.zeros_like(p)
-        seen[up] = light_from(rig, p[up], m[up], environment, pattern, np.asarray(gain))
+        seen[up] = light_from(rig, p[up], m[up], environment, pattern, np.asarray(gain), falloff)
         down = p[~up] - m[~up] * (p[~up, 2:] / np.minimum(m[~up, 2:], -1e-9))
         seen[~up] = table_seen(rig, down, table, centre)
         out[hit] = seen * np.asarray(rig.ball_reflectance)

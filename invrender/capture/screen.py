@@ -612,7 +612,7 @@ class _Fit:
         """That of all unknowns, nought for those that are known. The display's curve counts as
         unknown even where it could not be fitted, and so does that of an 8-bit file."""
         was = self.free.copy()
-        if self.free[0]:
+        if self.free[0] or self.coded:
             if self.coded or not self.free[_GAMMA].any():
                 self.set_gamma_prior(DISPLAY.gamma_deviation)
             self.free[_GAMMA], self.free[_CURVE] = True, self.coded

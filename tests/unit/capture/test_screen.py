@@ -11,6 +11,8 @@ from invrender.capture import screen
 from invrender.capture.ball_image import trace_image
 from invrender.capture.mirror import make_ball
 from invrender.capture.settings import SCREEN_FIT, TONE_CURVE
+from invrender.colour import linear_to_srgb, srgb_to_linear
+from invrender.device import IDEAL, Device
 from invrender.files.images import Photo
 from invrender.rig import Rig
 
@@ -94,6 +96,51 @@ def test_a_moved_screen_is_found(clean):
     assert np.linalg.norm(shift) < 6e-4
     assert np.linalg.norm(tilt) < 0.4
     np.testing.assert_allclose(found.gain, GAIN, rtol=0.01)
+    assert replace(found.device, gamma=IDEAL.gamma) == IDEAL  # what is not there is not fitted
+    np.testing.assert_allclose(found.device.gamma, 1, atol=0.02)
+    assert found.response is None and 0 < found.gain_deviation < 0.01
+
+
+DISPLAY = Device(
+    0.9, (1.05, 1.0, 0.95), 0.004, ((0.95, 0.03, 0.02), (0.01, 0.94, 0.05), (0, 0.04, 0.96))
+)
+
+
+def test_a_display_that_dims_and_mixes_keeps_its_gain():
+    pattern = noise_pattern()
+    image = photograph(MOVED, *SIZE, pattern=DISPLAY.shown(pattern), gain=GAIN, falloff=0.9)
+    grain = 0.01 * np.sqrt(image) * np.random.default_rng(2).standard_normal(image.shape)
+    found = screen.fit_screen(Photo(np.maximum(image + grain, 0)), RIG, IMAGE, pattern)
+    np.testing.assert_allclose(found.gain, GAIN, rtol=0.02)
+    assert found.device.falloff == pytest.approx(0.9, abs=0.06)
+    np.testing.assert_allclose(found.device.mixing, DISPLAY.mixing, atol=0.012)
+    np.testing.assert_allclose(found.device.gamma, DISPLAY.gamma, atol=0.03)
+
+
+def noise_pattern():
+    """Blocks of many levels, (64, 64, 3)."""
+    levels = np.random.default_rng(3).choice([0.02, 0.05, 0.15, 0.4, 1.0], (8, 8, 3))
+    return np.repeat(np.repeat(levels, 8, 0), 8, 1)
+
+
+@pytest.mark.parametrize("shoulder", [0.0, 1.5])
+def test_a_tone_curve_is_undone(shoulder):
+    pattern, scale = noise_pattern(), 0.5
+    rig = replace(RIG, ball_radius=0.02)
+    image = scale * photograph(rig, *SIZE, pattern=pattern, gain=GAIN, samples=3)
+    curved = image * (1 + shoulder * 0.14) / (1 + shoulder * image)
+    encoded = np.round(linear_to_srgb(np.clip(curved, 0, 1)) * 255) / 255
+    photo = Photo(srgb_to_linear(encoded).astype(np.float32), 0.97)
+    ball = make_ball(rig, rig.ball_centre, rig.ball_radius, SIZE)
+    found = screen.fit_screen(photo, rig, trace_image(rig, ball), pattern)
+    assert (found.response is not None) == (shoulder > 0)
+    np.testing.assert_allclose(found.gain, scale * np.array(GAIN), rtol=0.1 if shoulder else 0.02)
+    assert found.gain_deviation > 0.01  # nobody knows a JPEG's curve
+    if found.response:
+        straight = found.response.undo(photo)
+        table = np.abs(straight.image / image - 1)[:200, :200]
+        assert np.median(table) < 0.06
+        assert straight.clip_level > photo.clip_level
 
 
 def test_a_ball_moved_by_nothing_changes_nothing(hard):
