@@ -335,8 +335,8 @@ class _Fit:
     def device(self, u: Array) -> Device:
         """The display that ``u`` describes."""
         gamma = tuple(np.exp(u[_GAMMA]).tolist()) if self.free[_GAMMA].any() else IDEAL.gamma
-        mixing = tuple(map(tuple, self.mixing(u).tolist()))
-        return Device(float(u[_FALLOFF]), gamma, float(u[_BLACK]), mixing)
+        red, green, blue = ((r, g, b) for r, g, b in self.mixing(u).tolist())
+        return Device(float(u[_FALLOFF]), gamma, float(u[_BLACK]), (red, green, blue))
 
     def blur(self, out: Array, u: Array, slope: bool) -> Array:
         """Images (n, H, W, C) blurred as the camera does; last, if asked for, the slope by that."""
