@@ -26,6 +26,8 @@ from invrender.types import Array, InputError
 GREATEST_MISFIT = 0.05  # of the square's side by which corners may miss those of any camera
 FARTHEST = 1.0  # of the sample's size that the camera may stand off
 STEEPEST = 60.0  # degrees that it may be tilted
+TOO_LOW = 0.1  # of the screen's height, below which no camera is looked for
+INSIDE = 0.99  # of the bounds, where the search may start
 
 
 def find_corrected_lights(capture: Capture, fix: dict[str, Any]) -> FoundLights:
@@ -84,6 +86,8 @@ def camera_of_corners(rig: Rig, corners: Array, height: int, width: int) -> Rig:
     Least squares over the camera's place and tilt. Raises `InputError` where no camera does.
     """
     side = float(np.linalg.norm(corners - np.roll(corners, 1, 0), axis=-1).mean())
+    if not side > 0:
+        raise InputError("the sample's corners lie in one point: drag each to its own corner")
     scale = np.array([rig.sample_size] * 3 + [math.degrees(1)] * 3)
 
     def posed(x: Array) -> Rig:
@@ -99,12 +103,8 @@ def camera_of_corners(rig: Rig, corners: Array, height: int, width: int) -> Rig:
     low[2] = max(low[2], (TOO_LOW - 1) * rig.screen_height / rig.sample_size)
     start = np.clip([*rig.camera_shift, *rig.camera_tilt] / scale, low * INSIDE, reach * INSIDE)
     best = least_squares(misfit, start, bounds=(low, reach), x_scale="jac")
-    if not side > 0 or np.abs(best.fun).max() > GREATEST_MISFIT:
+    if np.abs(best.fun).max() > GREATEST_MISFIT:
         raise InputError(
             "no camera sees a square at these four corners: drag each to the sample's own corner"
         )
     return posed(best.x)
-
-
-TOO_LOW = 0.1  # of the screen's height, below which no camera is looked for
-INSIDE = 0.99  # of the bounds, where the search may start

@@ -16,6 +16,7 @@ from typing import Any
 
 from invrender.types import InputError
 
+ENDING = 10.0  # seconds that a killed process gets to end
 CONTEXT = multiprocessing.get_context("spawn")
 
 
@@ -58,9 +59,15 @@ class Worker:
                     elif kind == "input":
                         raise InputError(value)
                     elif kind == "died":
+                        await asyncio.to_thread(self._process.join, ENDING)
+                        self._process = None
                         raise Died
                     else:
                         raise RuntimeError(value)
+            except asyncio.CancelledError:  # nobody waits for what it would still say
+                self.kill()
+                self._process = None
+                raise
             finally:
                 if end is not None:
                     end.cancel()
