@@ -32,7 +32,7 @@ from invrender.types import Array, InputError
 Tell = Callable[[Any], None]
 
 SHOWN = 1600  # pixels, the longer side of the photo on the page
-QUICK = 1000  # pixels, of the copy in which ball and sample are looked for first
+QUICK = 800  # pixels, of the copy in which ball and sample are looked for first
 PREVIEW = 64  # pixels a side of the first, quick maps
 THUMBNAIL = 320  # pixels a side
 TILED = 512  # pixels a side of the previews of a tile and of the relief
@@ -83,7 +83,9 @@ def check(tell: Tell, folder: str, number: int) -> dict[str, Any]:
         if not fix and max(shown.photo.image.shape) > QUICK:
             quick = _quick_look(capture)
             if quick:
-                answer |= quick | _show(turned(capture, quick["turn"]).photo, out)
+                answer |= quick
+                if quick["turn"]:
+                    answer |= _show(turned(capture, quick["turn"]).photo, out)
                 tell(answer)
         found = find_corrected_lights(capture, fix)
         turn = turn_between(capture.photo, found.capture.photo)
@@ -116,7 +118,10 @@ def _without_paths(text: str, folder: Path) -> str:
 def _quick_look(capture: Capture) -> dict[str, Any] | None:
     """Outlines in a small copy of the photo; None where the ball is not found in it."""
     photo = capture.photo
-    small = replace(capture, photo=replace(photo, image=block_means(photo.image, QUICK)))
+    image = block_means(photo.image[::2, ::2], QUICK)
+    # Of both shapes a hemisphere is what it is first taken for: one search less.
+    unknown = capture.unknown - {"ball_shape"}
+    small = replace(capture, photo=replace(photo, image=image), unknown=unknown)
     scale = photo.width / small.photo.width
     if capture.fov_from == "unknown":
         return None
