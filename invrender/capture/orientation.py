@@ -53,7 +53,7 @@ def find_ball_and_orientation(
         except InputError as error:
             problem = problem or error
             continue
-        if manual is None:
+        if manual is None and here.tilt_deviation is None:
             _check_uncropped(here, ball)
         expected = _correlation(
             unfold_pattern(here.photo, here.rig, ball, ORIENTATION.cells),
@@ -149,6 +149,9 @@ def _find_ball(
 
 
 def _posed(capture: Capture) -> tuple[Capture, float]:
+    """The capture with its camera where the sample's square says, unless that is known better."""
+    if capture.tilt_deviation is not None:
+        return capture, capture.tilt_deviation
     rig, tilt_deviation = find_camera(capture.photo, capture.rig)
     return replace(capture, rig=rig), tilt_deviation
 

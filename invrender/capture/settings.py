@@ -7,7 +7,7 @@ Another source is named where there is one. Relative numbers say of what.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 TINY = 1e-12  # keeps a quotient or a logarithm finite; below any radiance or length in use
 GAUSSIAN_SPREAD = 1.48  # standard deviation over median absolute deviation, of a Gaussian
@@ -207,6 +207,65 @@ class SquareFit:
     tenth: float = 0.9  # quantile; by hand
     least_power: tuple[float, float, float] = (1e-3, 1e-4, 1e-9)  # on, beside, whole; by hand
     even: tuple[float, float] = (4.0, 1e-6)  # of the median change, absolute; by hand
+
+
+@dataclass(frozen=True)
+class SheetFit:
+    """The capture sheet in a photo: `invrender.capture.sheet`."""
+
+    # Pixels of a marker where the rig expects it, in the copy that is searched, and in the next one
+    # where there are any.
+    copy_markers: tuple[float, ...] = (40.0, 80.0)  # by hand
+    toe: float = 0.1  # of the median radiance, added before the logarithm; by hand
+    brightest: float = 20.0  # of the median radiance, where the copy is cut; by hand
+    least_level: float = 1e-6  # of the maximum, the least median; by hand
+    window: int = 21  # pixels of the copy, of its adaptive threshold; by hand
+    least_marker: float = 0.35  # of the expected marker's side, that is read; by hand
+    cell_pixels: int = 8  # of a module, when it is read; by hand
+    cell_margin: float = 0.25  # of a module, left out at each side; by hand
+    corrected: float = 0.4  # of the bits that a dictionary can correct; by hand
+    least_markers: int = 3  # by which a sheet is used; by hand
+    in_place: float = 0.25  # markers' sides, from where the others say it is; by hand
+    least_in_place: float = 0.6  # of the markers, that must be; by hand
+    # Reach across an edge: modules, pixels at most.
+    passes: tuple[tuple[float, float], ...] = ((0.6, 1e3), (0.6, 6.0))  # by hand
+    edge_points: int = 12  # of an edge; by hand
+    edge_samples: int = 24  # across it; by hand
+    edge_inset: float = 0.12  # of an edge, left out at each end; by hand
+    end_samples: int = 4  # that show ink or paper alone; by hand
+    rounds: int = 3  # of an edge's robust line; by hand
+    least_spread: float = 0.01  # pixels; by hand
+    outlier: float = 3.0  # spreads; by hand
+    # Before the photo is seen. In heights of the camera: its place aside, and its height where the
+    # focal length is known, or not; of the logarithm of the focal length, from rig.toml or from
+    # EXIF's whole millimetres.
+    place_deviation: float = 0.3  # by hand
+    height_deviation: tuple[float, float] = (0.3, 0.05)  # by hand
+    focal_deviation: dict[str, float] = field(default_factory=lambda: {"rig": 0.005, "exif": 0.015})
+    unknown_focal_deviation: float = 0.5  # by hand
+    contradiction: float = 3.0  # deviations from which a stated one is not believed; by hand
+    ink_deviation: float = 0.01  # markers' sides; by hand
+    distortion_deviation: float = 0.05  # k1; by hand
+    # Of the photo's width, the optical axis from its middle: in whole and in cropped photos.
+    centre_deviation: float = 0.003  # by hand
+    cropped_deviation: float = 0.2  # by hand
+    step: float = 0.01  # heights, radians: the numbers' scale in the solver; by hand
+    first_deviation: float = 0.2  # pixels, of a corner, before it is measured; by hand
+    least_deviation: float = 0.02  # pixels; by hand
+    robust: float = 2.0  # deviations from which a corner counts less; by hand
+    fits: int = 3  # with the deviation from the one before; by hand
+    least_aside: float = 0.3  # of the ball's distance from the sample's middle; by hand
+    least_bend: float = 0.5  # pixels by which distortion must move a corner to be undone; by hand
+    sure: float = 3.0  # its deviations, likewise; by hand
+    largest_off: float = 0.01  # widths by which the photo may grow without black borders; by hand
+    patch_points: int = 6  # a side of a square of paper; by hand
+    patch_inside: float = 0.6  # of its side; by hand
+    patch_noise: float = 0.03  # of its radiance; by hand
+    least_patches: int = 8  # squares of paper that tell the gain; by hand
+    screen_cells: int = 24  # of the screen, a side; by hand
+    environment_rows: int = 32  # by hand
+    room_deviation: float = 0.5  # of the room's factor about 1; by hand
+    scale: float = 0.02  # of the ball's radius, by which it contradicts the sheet's; by hand
 
 
 @dataclass(frozen=True)
@@ -467,6 +526,7 @@ BALL_SEARCH = BallSearch()
 MIRRORED_TABLE = MirroredTable()
 RIM_FIT = RimFit()
 SQUARE_FIT = SquareFit()
+SHEET_FIT = SheetFit()
 ORIENTATION = Orientation()
 BALL_SHAPE = BallShape()
 FIELD_OF_VIEW = FieldOfView()

@@ -25,11 +25,11 @@ class Capture:
     that of its folder.
 
     ``fov_from`` says where the rig's field of view is known from: "rig" (rig.toml), "exif", or
-    "unknown". ``unknown``: which of the rig's "ball_reflectance" and "ball_shape" nobody states, so
-    that they are found in the photo. ``warnings`` tell what is doubtful about the files. ``truth``
-    and
-    ``true_environment`` come with synthetic captures only: to measure errors against, never an
-    input.
+    "unknown"; `invrender.capture.sheet` sets "sheet", and ``tilt_deviation``, the expected error of
+    the camera's tilt in degrees. ``unknown``: which of the rig's "ball_reflectance" and
+    "ball_shape" nobody states, so that they are found in the photo. ``warnings`` tell what is
+    doubtful about the files. ``truth`` and ``true_environment`` come with synthetic captures only:
+    to measure errors against, never an input.
     """
 
     photo: Photo
@@ -41,6 +41,7 @@ class Capture:
     warnings: tuple[Notice, ...] = ()
     name: str = "capture"
     unknown: frozenset[str] = frozenset()
+    tilt_deviation: float | None = None
 
 
 def load_capture(folder: str | Path) -> Capture:
