@@ -29,6 +29,7 @@ DICTIONARY = "DICT_5X5_1000"
 MODULES = 7  # black or white squares across a marker
 FAMILY = 100  # numbers that a sheet takes of the dictionary's thousand
 FAMILY_STEP = 1.1  # ratio of two samples' sizes whose sheets have other numbers
+FAMILY_STRETCH = 1.02  # the same, of the rings' heights
 
 MARKER = 0.15  # sides of the sample: a marker's
 BORDER = 0.07  # the same, of plain paper between the window and the markers
@@ -88,7 +89,7 @@ def capture_sheet(rig: Rig) -> Sheet:
     middle += min(max(axis - middle, -room), room)
     left = float(middle - size[0] / 2)
     page = (left, -size[1] / 2, left + size[0], size[1] / 2)
-    first = _family(rig) * FAMILY
+    first = _family(side, high / near) * FAMILY
     if len(places) > FAMILY:
         raise InputError("the capture sheet would need more markers than there are")
     corners = places[:, None] + half
@@ -143,10 +144,12 @@ def _white(corners: Array, rig: Rig, page: tuple[float, ...], side: float) -> Ar
     return grid[free]
 
 
-def _family(rig: Rig) -> int:
-    """Which of the dictionary's ten families of markers a rig's sheet has: of sheets whose sizes
-    differ by `FAMILY_STEP` or more, one is not taken for the other's enlargement."""
-    return math.floor(math.log(rig.sample_size) / math.log(FAMILY_STEP)) % 10
+def _family(side: float, stretch: float) -> int:
+    """Which of the dictionary's ten families of markers a sheet has, by its sample's side and by
+    how much higher its ring is than the window needs: one sheet is not taken for another's
+    enlargement, if they differ by `FAMILY_STEP` or more, or for one seen aslant."""
+    steps = math.floor(math.log(side) / math.log(FAMILY_STEP))
+    return (steps + 3 * math.ceil(math.log(stretch) / math.log(FAMILY_STRETCH))) % 10
 
 
 def marker_dictionary() -> Any:

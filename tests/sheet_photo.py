@@ -60,7 +60,7 @@ def sheet_photo(
     room: Any = 0.3,
     k1: float = 0.0,
     centre: tuple[float, float] = (0.0, 0.0),
-    samples: int = 3,
+    samples: int = 2,
     blur: float = 0.0,
     vignetting: float = 0.0,
     noise: float = 0.0,
@@ -83,9 +83,9 @@ def sheet_photo(
     place = points.copy()
     for _ in range(lies):
         place[..., 0], place[..., 1] = place[..., 1].copy(), -place[..., 0].copy()
-    image = paper_reflectance(sheet, place)[..., None] / math.pi
-    image = image * lit(rig, gain, room)(points)
-    image = image.reshape(height, samples, width, samples, 3).mean((1, 3))
+    seen = paper_reflectance(sheet, place).reshape(height, samples, width, samples).mean((1, 3))
+    points = points[samples // 2 :: samples, samples // 2 :: samples]
+    image = seen[..., None] / math.pi * lit(rig, gain, room)(points)
     if blur:
         image = ndimage.gaussian_filter(image, (blur, blur, 0))
     edge = (d[samples // 2 :: samples, samples // 2 :: samples] ** 2).sum(-1)

@@ -22,6 +22,7 @@ from invrender.capture.orientation import find_ball_and_orientation, not_the_pat
 from invrender.capture.response import Response
 from invrender.capture.screen import Screen, fit_screen
 from invrender.capture.settings import PATTERN_CHECK, SCREEN_FIT, TABLE_LEVEL, UNFOLDING
+from invrender.capture.sheet import FoundSheet, use_paper, use_sheet
 from invrender.files.capture import Capture
 from invrender.files.images import Photo
 from invrender.lights import Lights
@@ -39,13 +40,15 @@ class FoundLights:
     """What `find_lights` returns.
 
     capture: with photo and pattern the right way round and the camera where it was found; ball:
-    None where no ball was needed; notices: what a person should know, the files' warnings first.
+    None where no ball was needed; notices: what a person should know, the files' warnings first;
+    sheet: None where the photo shows no capture sheet.
     """
 
     capture: Capture
     lights: Lights
     ball: Ball | None
     notices: tuple[Notice, ...]
+    sheet: FoundSheet | None = None
 
 
 def find_lights(
@@ -67,11 +70,13 @@ def find_lights(
         found = find_lights(capture)
         print(found.lights.gain, [notice.text for notice in found.notices])
     """
+    with threadpool_limits(1, "blas"):
+        capture, sheet, sheet_notices = use_sheet(capture)
     if environment is not None and gain is not None:
-        rig, _ = find_camera(capture.photo, capture.rig)
-        capture = replace(capture, rig=rig)
-        lights = Lights(rig, capture.pattern, environment, _rgb(gain))
-        return FoundLights(capture, lights, None, capture.warnings)
+        if sheet is None:
+            capture = replace(capture, rig=find_camera(capture.photo, capture.rig)[0])
+        lights = Lights(capture.rig, capture.pattern, environment, _rgb(gain))
+        return FoundLights(capture, lights, None, (*capture.warnings, *sheet_notices), sheet)
     fov_notices: tuple[Notice, ...] = ()
     # The matrices are small: more threads than one only slow each other down.
     with threadpool_limits(1, "blas"):
@@ -87,14 +92,17 @@ def find_lights(
             capture, mirror = use_reflectance(seen, found)
             lights, _ = _measure(capture, found, curve=False)
             mirror = (*mirror, Notice("photo-curve", CURVE_TEXT))
+            sheet = undone(sheet, response)
+        lights, paper = use_paper(sheet, lights, found)
     if environment is not None:
         lights = replace(lights, environment=environment)
     if gain is not None:
         lights = replace(lights, gain=_rgb(gain))
     notices = (
-        *capture.warnings, *fov_notices, *turned, *mirror, *light_warnings(lights)
+        *capture.warnings, *sheet_notices, *fov_notices, *turned, *mirror, *paper,
+        *light_warnings(lights),
     )  # fmt: skip
-    return FoundLights(capture, lights, found, notices)
+    return FoundLights(capture, lights, found, notices, sheet)
 
 
 def _rgb(gain: Any) -> Array:
@@ -251,7 +259,7 @@ def light_warnings(lights: Lights) -> tuple[Notice, ...]:
     """What is doubtful about the lights that a ball shows."""
     notices = []
     fit = lights.fit
-    if fit.get("saturated", 0) > SCREEN_FIT.saturated:
+    if fit.get("saturated", 0) > SCREEN_FIT.saturated and not fit.get("gain_by_paper"):
         text = (
             f"{fit['saturated']:.0%} of the screen is saturated in the ball; its radiance is "
             "guessed from the rest, and likely too low: expose shorter"

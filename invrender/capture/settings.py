@@ -253,6 +253,7 @@ class SheetFit:
     first_deviation: float = 0.2  # pixels, of a corner, before it is measured; by hand
     least_deviation: float = 0.02  # pixels; by hand
     robust: float = 2.0  # deviations from which a corner counts less; by hand
+    greatest_misfit: float = 0.03  # of a marker's side, in the photo: another sheet, or not flat
     fits: int = 3  # with the deviation from the one before; by hand
     least_aside: float = 0.3  # of the ball's distance from the sample's middle; by hand
     least_bend: float = 0.5  # pixels by which distortion must move a corner to be undone; by hand
@@ -265,6 +266,7 @@ class SheetFit:
     screen_cells: int = 24  # of the screen, a side; by hand
     environment_rows: int = 32  # by hand
     room_deviation: float = 0.5  # of the room's factor about 1; by hand
+    gains_differ: float = 3.0  # deviations between the gains by paper and ball; by hand
     scale: float = 0.02  # of the ball's radius, by which it contradicts the sheet's; by hand
 
 

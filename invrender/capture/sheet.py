@@ -18,7 +18,9 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from invrender.capture.ball_image import sample_image
-from invrender.capture.settings import CROPPING, GAUSSIAN_SPREAD, SHEET_FIT, TINY
+from invrender.capture.mirror import Ball
+from invrender.capture.response import Response
+from invrender.capture.settings import CROPPING, GAUSSIAN_SPREAD, SCREEN_FIT, SHEET_FIT, TINY
 from invrender.capture.table import room_irradiance
 from invrender.files.capture import Capture
 from invrender.files.images import Photo
@@ -142,6 +144,9 @@ def use_sheet(capture: Capture) -> tuple[Capture, FoundSheet | None, tuple[Notic
         if other.pull < SHEET_FIT.contradiction:
             fit, known = other, "unknown"
             stated = _fov(photo.width, focal)
+    side = float(np.median(np.linalg.norm(quads[:, 1] - quads[:, 0], axis=-1)))
+    if fit.residual > SHEET_FIT.greatest_misfit * side:
+        raise _another(sheet)
     full, deviation, residual = fit.camera, fit.deviation, fit.residual
     fov = _fov(photo.width, full.focal)
     principal = _pair((full.centre - _middle(photo)) / photo.width)
@@ -263,7 +268,7 @@ def _another(sheet: Sheet) -> InputError:
         "the photo shows another capture sheet than this rig's, whose window is "
         f"{1000 * sheet.window:.1f} mm wide and whose ball stands {1000 * sheet.ball[0]:.1f} mm "
         "from its middle: print that with 'invrender pattern --rig rig.toml -o guide.pdf', or "
-        "correct rig.toml"
+        "correct rig.toml, and lay it flat"
     )
 
 
@@ -294,7 +299,7 @@ def _notices(found: FoundSheet, stated: float | None, turns: int, lies: int) -> 
         notices.append(Notice("photo-turned", text))
     if lies:
         text = (
-            f"the capture sheet lies turned by {90 * (-lies % 4)}° against camera and screen; it "
+            f"the capture sheet lies turned by {90 * lies}° against camera and screen; it "
             "was taken as it lies"
         )
         notices.append(Notice("sheet-turned", text))
@@ -549,6 +554,14 @@ def _white_radiance(photo: Photo, rig: Rig, white: Array, side: float) -> tuple[
     return white[use][clear], np.median(seen[clear], 1)
 
 
+def undone(sheet: FoundSheet | None, response: Response) -> FoundSheet | None:
+    """The sheet as a photo shows it whose tone curve was undone."""
+    if sheet is None:
+        return None
+    radiance = response.undo(Photo(sheet.white_radiance[None])).image[0]
+    return replace(sheet, white_radiance=radiance)
+
+
 def screen_gain(found: FoundSheet, lights: Lights) -> tuple[Array, float] | None:
     """The screen's gain (3,) by the light on the paper, and the deviation of its logarithm.
 
@@ -559,8 +572,9 @@ def screen_gain(found: FoundSheet, lights: Lights) -> tuple[Array, float] | None
     if len(found.white) < SHEET_FIT.least_patches:
         return None
     cells = SHEET_FIT.screen_cells
-    pattern = resize_pattern(lights.pattern, cells)
-    screen = np.einsum("nij,ijc->nc", lights.rig.screen_cosines(found.white, cells), pattern)
+    pattern = resize_pattern(lights.shown, cells)
+    cosines = lights.rig.screen_cosines(found.white, cells, lights.device.falloff)
+    screen = np.einsum("nij,ijc->nc", cosines, pattern)
     environment = resample_environment(lights.environment, SHEET_FIT.environment_rows)
     room = room_irradiance(lights.rig, found.white, environment)
     seen = found.white_radiance * (math.pi / PAPER)
@@ -585,3 +599,46 @@ def screen_gain(found: FoundSheet, lights: Lights) -> tuple[Array, float] | None
         return None
     fitted = float(np.sqrt(np.diag(covariance)[:3].max()) / done.x[:3].min())
     return gain, math.hypot(fitted, PAPER_DEVIATION / PAPER)
+
+
+def use_paper(
+    sheet: FoundSheet | None, lights: Lights, ball: Ball
+) -> tuple[Lights, tuple[Notice, ...]]:
+    """The lights with the screen's gain by the paper where the ball's image of it is saturated;
+    and what is doubtful about sheet, ball and gain together.
+
+    Adds to ``lights.fit``: paper_gain, the gain by the paper over that by the ball, and
+    paper_gain_deviation, of its logarithm.
+    """
+    if sheet is None:
+        return lights, ()
+    notices = []
+    ratio = ball.radius_m / lights.rig.ball_radius
+    if abs(math.log(ratio)) > SHEET_FIT.scale:
+        text = (
+            f"measured by the capture sheet, the ball's radius is {1000 * ball.radius_m:.2f} mm, "
+            f"not {1000 * lights.rig.ball_radius:.2f}: either the sheet was printed at "
+            f"{1 / ratio:.0%} of its size (its line of 100 mm tells) or [ball] radius is wrong"
+        )
+        notices.append(Notice("sheet-scale", text))
+    measured = screen_gain(sheet, lights)
+    if measured is None:
+        return lights, tuple(notices)
+    gain, deviation = measured
+    off = float(np.mean(gain) / np.mean(lights.gain))
+    fit = {**lights.fit, "paper_gain": off, "paper_gain_deviation": deviation}
+    if fit.get("saturated", 0) > SCREEN_FIT.saturated:
+        text = (
+            f"{fit['saturated']:.0%} of the screen is saturated in the ball; its radiance was "
+            f"taken from the capture sheet's paper, to within {deviation:.0%}"
+        )
+        notices.append(Notice("gain-by-paper", text))
+        fit["gain_by_paper"] = 1.0
+        return replace(lights, gain=gain.astype(np.float32), fit=fit), tuple(notices)
+    if abs(math.log(off)) > SHEET_FIT.gains_differ * deviation:
+        text = (
+            f"the light on the capture sheet's paper is {off:.2f} times what the ball's image of "
+            "the screen explains: check [ball] reflectance, and that the paper is plain and white"
+        )
+        notices.append(Notice("paper-contradicts-ball", text))
+    return replace(lights, fit=fit), tuple(notices)
