@@ -22,7 +22,7 @@ from invrender.capture.orientation import find_ball_and_orientation, not_the_pat
 from invrender.capture.response import Response
 from invrender.capture.screen import Screen, fit_screen
 from invrender.capture.settings import PATTERN_CHECK, SCREEN_FIT, TABLE_LEVEL, UNFOLDING
-from invrender.capture.sheet import FoundSheet, use_paper, use_sheet
+from invrender.capture.sheet import FoundSheet, undone, use_paper, use_sheet
 from invrender.files.capture import Capture
 from invrender.files.images import Photo
 from invrender.lights import Lights
