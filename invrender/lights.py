@@ -55,6 +55,11 @@ class Lights:
         """Relative radiance (h, w, 3) straight ahead of the screen: the pattern as displayed."""
         return self.device.shown(self.pattern)
 
+    def scaled(self, screen: Array, room: Array) -> Lights:
+        """With the screen's and the room's radiance times RGB factors."""
+        gain = np.broadcast_to(np.asarray(self.gain, np.float32), 3) * screen
+        return replace(self, gain=gain, environment=self.environment * room)
+
     def turned(self, quarters: int) -> Lights:
         """Seen from a sample that is turned clockwise: all turned counter-clockwise by quarters
         about its normal. For the forward model alone: the ball stays, and so does ``coverage``."""

@@ -68,11 +68,13 @@ class Sample:
     def observation(self, turn: int = 0) -> Observation:
         """With its forward model, turned counter-clockwise by quarters."""
         from invrender.refine.gauss_newton import Observation
+        from invrender.refine.shared import light_doubt
         from invrender.render.fast.estimator import Fast
 
         photo = np.ascontiguousarray(np.rot90(self.photo, turn))
         clipped = np.rot90(self.clipped, turn) if self.clipped.any() else None
-        return Observation(photo, Fast.under(self.lights.turned(turn)), clipped)
+        doubt = light_doubt(self.lights.fit)
+        return Observation(photo, Fast.under(self.lights.turned(turn)), clipped, doubt)
 
 
 def refine_capture(
@@ -154,6 +156,8 @@ def _reconstruct(
         crops = [Sample.of(f, size) for f in found]
     start, refined, shots = estimate_maps(crops, stage, init, samples, keep)
     first, lights, renderer = crops[0], found[0].lights, shots[0].renderer
+    if refined.factors:
+        lights = lights.scaled(*refined.factors[0])
     with stage("render"):
         from invrender.refine.checks import baked_light, coarse_error, photo_error
         from invrender.refine.theta import deviations
@@ -212,6 +216,7 @@ def estimate_maps(
         from invrender.refine.posterior import explain
         from invrender.refine.priors import lobe_prior, network_prior, pooled
         from invrender.refine.several import find_turn
+        from invrender.refine.shared import share
         from invrender.refine.theta import to_maps
 
         photos = [c.observation() for c in crops]
@@ -254,7 +259,11 @@ def estimate_maps(
             left = prior.sigma if prior.total is None else prior.total
             result = Refined(to_maps(prior.mean), left, interrupted=True)
         else:
-            result = explain(photos, prior, samples=samples)
+            known = share(photos, prior, samples=samples)
+            photos = known.observations
+            result = explain(photos, known.prior, samples=samples)
+            result.factors = known.factors
+            result.converged &= known.converged
     return starts[0], result, photos
 
 

@@ -44,19 +44,23 @@ BAND = 1 << 17  # pixels solved at once
 class Observation:
     """A photo (H, W, 3) of the sample, linear radiance, and the lights on it.
 
-    clipped (H, W): pixels that the photo does not measure; None where it measures all.
+    clipped (H, W): pixels that the photo does not measure; None where it measures all. doubt:
+    deviations of the logarithms of the screen's and of the room's radiance; (0, 0) where the lights
+    are known.
     """
 
     photo: Array
     renderer: Renderer
     clipped: NDArray[np.bool_] | None = None
+    doubt: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass
 class Refined:
     """Maps, their posterior standard deviations (H, W, 9) in the order of θ, how the fit went.
 
-    interrupted: by Ctrl-C; the maps are the best so far.
+    interrupted: by Ctrl-C; the maps are the best so far. factors: of each photo's screen and room,
+    RGB, by which the lights were found to be off; empty where they were not fitted.
     """
 
     maps: Maps
@@ -64,6 +68,7 @@ class Refined:
     history: list[dict[str, float]] = field(default_factory=list)
     converged: bool = False
     interrupted: bool = False
+    factors: list[tuple[Array, Array]] = field(default_factory=list)
 
 
 def linearise(

@@ -12,7 +12,7 @@ carries along; lights and pose are differentiated by Dr.Jit through the same cod
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -60,6 +60,18 @@ class Renderer(ABC):
     def under(cls, lights: Lights) -> Self:
         """Prepared for these lights."""
         return cls(scene_under(lights))
+
+    def scaled(self, screen: Any, room: Any) -> Self:
+        """Under the same lights with the screen's and the room's radiance times a number or RGB."""
+        scene = self.scene
+        scalar = scene.scalar
+        vec3 = vector(scalar, 3)
+        by = [dr.opaque(scalar, float(x)) for x in np.broadcast_to(screen, 3)]
+        environment = scene.environment
+        if environment is not None and np.any(np.asarray(room) != 1):
+            rgb = aligned(np.tile(np.broadcast_to(room, 3), dr.width(environment) // 3), scalar)
+            environment = environment * scalar(rgb)
+        return type(self)(replace(scene, gain=scene.gain * vec3(*by), environment=environment))
 
     @abstractmethod
     def _shade(

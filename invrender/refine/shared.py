@@ -1,0 +1,381 @@
+"""What a sample's materials share, and what its lights are off by, from all pixels at once.
+
+A network errs on a material as a whole: its roughness is off by much the same everywhere, its
+albedo is tinted. One pixel cannot tell, a thousand under different parts of the pattern can. With
+a network's maps θ₀, weights w of the materials and the deviations S of what a material is off by,
+
+    θ = θ₀ + Σ_k w_k·S·z_k + e,     photo ~ gain·I_screen(θ) + room·I_room(θ) + noise;
+
+unknowns are z, (materials, 7), and the logarithms of gain and room of each photo, RGB. They are
+found by Gauss–Newton steps with each pixel's own e marginalised: the photo is compared by the
+means of parts of each material, whose expected spread J·Σ_e·Jᵀ + R includes e. What is far beyond
+it counts little (Student's t).
+
+- **Lights.** The prior of gain and room is what the capture says of them (`Observation.doubt`):
+  the screen's image in the ball fits to a part in a thousand, or a lamp was saturated. Lights that
+  are known are no unknowns, and cost nothing.
+- **Dielectrics** mirror alike in all colours and places. A network's f0 follows the light's
+  pattern, and the roughness with it: before anything is fitted f0 becomes the sample's median.
+- **Relief** that the maps do not resolve widens the lobe, like a greater roughness. What the photo
+  asks for is shared out between the two by their variances.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.cluster.vq import kmeans2
+
+from invrender.refine.gauss_newton import Observation, linearise
+from invrender.refine.priors import Prior
+from invrender.refine.theta import D, N, R, S, project
+from invrender.types import Array
+
+UNKNOWNS = 7  # of a material: what θ has but slopes
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All chosen by hand on 9 simulated captures, of which 5 others told whether it carries over
+    (docs/research-log/2026-11-29-what-materials-share.md). Pairs: a constant, and a share of the
+    albedo."""
+
+    side: int = 64  # pixels a side that are compared
+    parts: int = 16  # a side, whose means are compared
+    independent: float = 0.3  # of the parts: what the model lacks is wider than one of them
+    noise: tuple[float, float] = (0.03, 0.01)  # of the pixel and of the photo's mean
+    freedom: float = 4.0  # Student's, of a part's residual
+    steps: int = 5
+    settled: float = 0.3  # decrease of the cost, -2 log posterior, that ends the steps
+    longest: float = 0.1  # step of roughness
+    # what a material is off by
+    shared_diffuse: tuple[float, float] = (0.01, 0.1)
+    shared_specular: tuple[float, float] = (0.004, 0.2)
+    shared_roughness: float = 0.08
+    alike: tuple[float, float] = (0.9, 0.3)  # correlation of materials: of one kind; of two
+    # what a part is off by
+    part_diffuse: tuple[float, float] = (0.013, 0.1)
+    part_specular: tuple[float, float] = (0.002, 0.02)
+    part_roughness: float = 0.01
+    part_slope: tuple[float, float] = (0.005, 0.15)  # at least; of a pixel's expected error
+    correlation: tuple[float, float] = (0.9, 0.95)  # of the channels of k_d, and of k_s
+    relief: float = 0.5  # deviation of the share of the expected slopes that widens the lobe
+    metal_f0: tuple[float, float] = (0.06, 0.36)  # k_s of no metal, and of nothing but metal
+    dielectric_f0: tuple[float, float] = (0.08, 0.15)  # surely dielectric; no longer one
+    least_doubt: float = 0.001  # of the logarithm of the screen's radiance, at least
+    room_doubt: float = 0.05  # of the room's
+    raised_doubt: float = 0.6  # of the logarithm by which saturated lamps were raised
+    hidden_doubt: float = 0.1  # where a lamp behind the screen was added
+    channels: float = 0.5  # of the lights' doubt, by which each colour may differ
+    # the materials: groups of like sqrt(k_d), sqrt(f0) and ρ
+    materials: int = 4
+    mirror_weight: float = 1.5  # of sqrt(f0)
+    alike_distance: float = 0.12  # of groups that are one
+    softness: float = 0.05  # deviation of a pixel from its group
+    least_part: float = 0.02  # of the sample that a group has
+    shared_share: float = 0.5  # of a network's squared error that a material shares
+
+
+SETTINGS = Settings()
+
+
+@dataclass(frozen=True)
+class Shared:
+    """prior: with the maps as their materials are found to be. observations: with the lights as
+    they are found. factors: of each photo's screen and room, RGB. converged: the steps ended by
+    themselves. misfit: mean square of the parts' residuals over what is expected."""
+
+    prior: Prior
+    observations: list[Observation]
+    factors: list[tuple[Array, Array]] = field(default_factory=list)
+    converged: bool = True
+    misfit: float = 0.0
+
+
+def share(
+    observations: Sequence[Observation], prior: Prior, *, samples: int = 64, s: Settings = SETTINGS
+) -> Shared:
+    """The prior and the lights after what all pixels tell together.
+
+    prior: a network's maps (H, W, 9), ``total`` their expected errors.
+    """
+    theta = plain_dielectric(project(prior.mean.copy()), s)
+    centres = group(theta[_grid(theta, s)], s)
+    problem = _Problem(observations, prior, theta, centres, samples, s)
+    solution, covariance, misfit, converged = _solve(problem, s)
+    weight = belongs(theta, centres, s)
+    z, rest = problem.offsets(solution, covariance)
+    theta[..., :UNKNOWNS] += shared_sigma(theta, s) * (weight @ z)
+    total = prior.sigma if prior.total is None else prior.total
+    less = 1 - s.shared_share * np.clip(weight @ (1 - rest), 0, 1)
+    total = total.copy()
+    total[..., :UNKNOWNS] *= np.sqrt(less)
+    factors = problem.factors(solution)
+    shots = [
+        o if o.doubt == (0, 0) else replace(o, renderer=o.renderer.scaled(*f))
+        for o, f in zip(observations, factors, strict=True)
+    ]
+    return Shared(
+        replace(prior, mean=project(theta.astype(np.float32)), total=total),
+        shots, factors, converged, misfit,
+    )  # fmt: skip
+
+
+def light_doubt(fit: dict[str, float], s: Settings = SETTINGS) -> tuple[float, float]:
+    """Deviations of the logarithms of screen and room, by `Lights.fit`; nought of known lights."""
+    if not fit:
+        return 0.0, 0.0
+    room = s.room_doubt + s.raised_doubt * float(np.log(max(fit.get("room_raised", 1.0), 1.0)))
+    room += s.hidden_doubt * (fit.get("hidden_lamp", 1.0) > 1)
+    return max(float(fit.get("residual", 0.0)), s.least_doubt), room
+
+
+def plain_dielectric(theta: Array, s: Settings = SETTINGS) -> Array:
+    """Maps θ in which every dielectric has the sample's median f0, grey; in place."""
+    f0 = theta[..., S].mean(-1)
+    low, high = s.dielectric_f0
+    sure = f0 < low
+    if sure.any():
+        weight = np.clip((high - f0) / (high - low), 0, 1)[..., None]
+        theta[..., S] += weight * (np.median(f0[sure]) - theta[..., S])
+    return theta
+
+
+def shared_sigma(theta: Array, s: Settings = SETTINGS) -> Array:
+    """Deviations (H, W, 7) of what a material is off by."""
+    return _sigma(theta, s.shared_diffuse, s.shared_specular, s.shared_roughness, s)
+
+
+def _sigma(
+    theta: Array, diffuse: tuple[float, float], specular: tuple[float, float], roughness: float,
+    s: Settings,
+) -> Array:  # fmt: skip
+    none, all_ = s.metal_f0
+    k_s = theta[..., S]
+    sigma = np.empty((*theta.shape[:-1], UNKNOWNS), np.float32)
+    sigma[..., D] = diffuse[0] + diffuse[1] * theta[..., D]
+    sigma[..., S] = specular[0] + specular[1] * k_s * np.clip((k_s - none) / (all_ - none), 0, 1)
+    sigma[..., R] = roughness
+    return sigma
+
+
+def _features(theta: Array, s: Settings) -> Array:
+    mirror = s.mirror_weight * np.sqrt(theta[..., S].mean(-1, keepdims=True))
+    return np.concatenate([np.sqrt(theta[..., D]), mirror, theta[..., R : R + 1]], -1)
+
+
+def group(theta: Array, s: Settings = SETTINGS) -> Array:
+    """Centres (materials, 5) of like pixels of maps θ."""
+    points = _features(theta, s).reshape(-1, 5).astype(np.float64)
+    mean = points.mean(0, keepdims=True)
+    if len(points) < s.materials or points.std(0).max() < s.softness:
+        return mean
+    centres, label = kmeans2(points, s.materials, minit="++", rng=np.random.default_rng(0))
+    shares = np.bincount(label, minlength=len(centres)) / len(points)
+    kept: list[Array] = []
+    for k in np.argsort(-shares):
+        apart = all(np.linalg.norm(centres[k] - c) > s.alike_distance for c in kept)
+        if shares[k] >= s.least_part and apart:
+            kept.append(centres[k])
+    return np.array(kept)
+
+
+def belongs(theta: Array, centres: Array, s: Settings = SETTINGS) -> Array:
+    """How much each pixel is of each material (H, W, materials), together one."""
+    apart = ((_features(theta, s)[..., None, :] - centres) ** 2).sum(-1)
+    weight = np.exp((apart.min(-1, keepdims=True) - apart) / (2 * s.softness**2))
+    return (weight / weight.sum(-1, keepdims=True)).astype(np.float32)
+
+
+def _grid(image: Array, s: Settings) -> tuple[Array, Array]:
+    """Indices of the pixels that are compared."""
+    rows, columns = (
+        ((np.arange(n) + 0.5) / n * of).astype(np.intp)
+        for n, of in ((min(s.side, m), m) for m in image.shape[:2])
+    )
+    return np.ix_(rows, columns)  # type: ignore[return-value]
+
+
+class _Problem:
+    """The unknowns u: z of each material, then log gain and log room (6) of each doubtful photo."""
+
+    def __init__(
+        self, observations: Sequence[Observation], prior: Prior, theta: Array, centres: Array,
+        samples: int, s: Settings,
+    ) -> None:  # fmt: skip
+        at = _grid(theta, s)
+        self.s, self.samples, self.observations = s, samples, observations
+        self.theta = theta[at]
+        self.weight = belongs(self.theta, centres, s)
+        self.photos = [o.photo[at] for o in observations]
+        self.seen = [
+            np.ones(self.theta.shape[:2]) if o.clipped is None else ~o.clipped[at] * 1.0
+            for o in observations
+        ]
+        self.dark = [None if o.doubt == (0, 0) else o.renderer.scaled(0.0, 1.0)
+                     for o in observations]  # fmt: skip
+        self.shared = shared_sigma(self.theta, s)
+        total = (prior.sigma if prior.total is None else prior.total)[at]
+        own = _sigma(self.theta, s.part_diffuse, s.part_specular, s.part_roughness, s)
+        least, of = s.part_slope
+        slopes = np.maximum(least, of * total[..., N])
+        self.own = np.concatenate([own, slopes], -1).astype(np.float32)
+        self.correlation = np.eye(9)
+        for k, r in ((D, s.correlation[0]), (S, s.correlation[1])):
+            self.correlation[k, k] = r + (1 - r) * np.eye(3)
+        # Unresolved relief: α² grows by twice the slopes' variance.
+        rho = self.theta[..., R]
+        widened = (rho**4 + 2 * (total[..., N] ** 2).mean(-1)) ** 0.25 - rho
+        size = np.maximum(self.weight.sum((0, 1)), 1e-9)
+        widened = s.relief * np.einsum("hw,hwk->k", widened, self.weight) / size
+        self.apparent = np.ones((len(centres), UNKNOWNS))  # deviation of z as it is seen
+        self.apparent[:, R] = np.hypot(1, widened / s.shared_roughness)
+        none, all_ = s.metal_f0
+        metal = np.clip((self.theta[..., S].mean(-1) - none) / (all_ - none), 0, 1)
+        self.metal = np.einsum("hw,hwk->k", metal, self.weight) / size
+        h, w = self.theta.shape[:2]
+        rows, columns = (np.arange(n) * min(s.parts, n) // n for n in (h, w))
+        self.part = (rows[:, None] * (columns[-1] + 1) + columns).ravel()
+        self.parts = int(self.part[-1]) + 1
+        self.materials = len(centres)
+        doubtful = [i for i, d in enumerate(self.dark) if d is not None]
+        self.light = {i: self.materials * UNKNOWNS + 6 * k for k, i in enumerate(doubtful)}
+        self.size = self.materials * UNKNOWNS + 6 * len(doubtful)
+        self.precision = np.linalg.inv(self._covariance())
+
+    def _covariance(self) -> Array:
+        """Of the unknowns before the photo is seen."""
+        s, n = self.s, self.materials * UNKNOWNS
+        same, other = s.alike
+        alike = same - (same - other) * np.abs(self.metal[:, None] - self.metal)
+        alike += np.diag(1 - np.diag(alike))
+        covariance = np.zeros((self.size, self.size))
+        covariance[:n, :n] = np.kron(alike, self.correlation[:UNKNOWNS, :UNKNOWNS])
+        for i, k in self.light.items():
+            for j, sigma in enumerate(self.observations[i].doubt):
+                at = slice(k + 3 * j, k + 3 * j + 3)
+                each = np.eye(3) * s.channels**2
+                covariance[at, at] = max(sigma, 1e-4) ** 2 * (1 + each)
+        return covariance
+
+    def factors(self, u: Array) -> list[tuple[Array, Array]]:
+        """Of each photo's screen and room, RGB."""
+        one = np.ones(3, np.float32)
+        return [
+            (one, one) if i not in self.light
+            else tuple(np.exp(u[self.light[i] :][:6]).astype(np.float32).reshape(2, 3))
+            for i in range(len(self.observations))
+        ]  # fmt: skip
+
+    def offsets(self, u: Array, covariance: Array) -> tuple[Array, Array]:
+        """z (materials, 7) without what relief makes of roughness, and the share of the prior's
+        variance that is left of each."""
+        n = self.materials * UNKNOWNS
+        true = 1 / self.apparent**2  # share of what is seen
+        z = u[:n].reshape(-1, UNKNOWNS) * self.apparent * true
+        left = np.diag(covariance)[:n].reshape(-1, UNKNOWNS)
+        return z.astype(np.float32), (1 - true * (1 - left)).astype(np.float32)
+
+    def evaluate(self, u: Array) -> tuple[Array, Array, Array]:
+        """Of every part of every material: residual (P, 3), its derivative (P, 3, unknowns) and the
+        precision of its expected spread (P, 3, 3)."""
+        n = self.materials * UNKNOWNS
+        theta = self.theta.copy()
+        z = u[:n].reshape(-1, UNKNOWNS) * self.apparent
+        theta[..., :UNKNOWNS] += self.shared * (self.weight @ z.astype(np.float32))
+        theta = project(theta)
+        found = [self._photo(i, theta, f) for i, f in enumerate(self.factors(u))]
+        residual, derivative, precision = (np.concatenate(x) for x in zip(*found, strict=True))
+        return residual, derivative, precision
+
+    def _photo(self, i: int, theta: Array, factors: tuple[Array, Array]) -> tuple[Array, ...]:
+        s, photo = self.s, self.photos[i]
+        image, jacobian = linearise(self.observations[i].renderer, theta, self.samples)
+        lights = np.zeros((*image.shape, 6), np.float32)
+        dark = self.dark[i]
+        if dark is not None:
+            room = linearise(dark, theta, self.samples)[0]
+            screen = factors[0] * (image - room)
+            room = factors[1] * room
+            jacobian *= ((screen + room) / np.maximum(image, 1e-12 * image.mean() + 1e-30))[
+                ..., None
+            ]
+            image = screen + room
+            for c in range(3):
+                lights[..., c, c], lights[..., c, 3 + c] = screen[..., c], room[..., c]
+        own = jacobian * self.own[..., None, :]
+        noise = (s.noise[0] * photo) ** 2 + (s.noise[1] * photo.mean()) ** 2
+        shared = jacobian[..., :UNKNOWNS] * self.shared[..., None, :]
+        parts = []
+        for k in range(self.materials):
+            weight = (self.weight[..., k] * self.seen[i]).ravel()
+            fill = np.bincount(self.part, weight, self.parts)
+            full = np.bincount(self.part, minlength=self.parts)
+            kept = fill > 0.05 * full
+
+            def means(x: Array, weight: Array = weight, fill: Array = fill, kept: Array = kept):
+                columns = x.reshape(len(weight), -1).T
+                sums = [np.bincount(self.part, weight * c, self.parts)[kept] for c in columns]
+                return (np.array(sums) / fill[kept]).T.reshape(-1, *x.shape[2:])
+
+            derivative = np.zeros((int(kept.sum()), 3, self.size))
+            at = slice(k * UNKNOWNS, (k + 1) * UNKNOWNS)
+            derivative[..., at] = means(shared) * self.apparent[k]
+            if dark is not None:
+                derivative[..., self.light[i] : self.light[i] + 6] = means(lights)
+            a = means(own)
+            spread = a @ self.correlation @ np.swapaxes(a, 1, 2)
+            spread[:, range(3), range(3)] += means(noise)
+            independent = s.independent * (fill / full)[kept]
+            precision = np.linalg.inv(spread) * independent[:, None, None]
+            parts.append((means(photo - image), derivative, precision))
+        return tuple(np.concatenate(x) for x in zip(*parts, strict=True))
+
+
+def _solve(problem: _Problem, s: Settings) -> tuple[Array, Array, float, bool]:
+    """The unknowns of least cost, their covariance, the parts' misfit, whether steps ended by
+    themselves."""
+    n = problem.materials * UNKNOWNS
+
+    def cost_of(u: Array, found: tuple[Array, Array, Array]) -> tuple[float, Array]:
+        surprise = np.einsum("pc,pcd,pd->p", found[0], found[2], found[0])
+        cost = (s.freedom + 3) * np.log1p(surprise / s.freedom).sum() + u @ problem.precision @ u
+        return float(cost), surprise
+
+    u = np.zeros(problem.size)
+    found = problem.evaluate(u)
+    cost, surprise = cost_of(u, found)
+    converged = False
+    for _ in range(s.steps):
+        hessian, gradient = _normal(problem, u, found, surprise, s)
+        step = np.linalg.solve(hessian, gradient)
+        rho = step[:n].reshape(-1, UNKNOWNS)[:, R] * problem.apparent[:, R] * s.shared_roughness
+        step *= min(1.0, s.longest / max(float(np.abs(rho).max()), 1e-9))
+        for shorter in (1.0, 1 / 3, 1 / 9):
+            trial = problem.evaluate(u + shorter * step)
+            new, unlikely = cost_of(u + shorter * step, trial)
+            if new < cost:
+                break
+        else:
+            converged = True
+            break
+        converged = cost - new < s.settled
+        u, found, surprise, cost = u + shorter * step, trial, unlikely, new
+        if converged:
+            break
+    covariance = np.linalg.inv(_normal(problem, u, found, surprise, s)[0])
+    return u, covariance, float(surprise.mean() / 3 / s.independent), converged
+
+
+def _normal(
+    problem: _Problem, u: Array, found: tuple[Array, Array, Array], surprise: Array, s: Settings
+) -> tuple[Array, Array]:
+    """The normal equations at u, parts weighted by how likely their residuals are."""
+    residual, derivative, precision = found
+    trust = (s.freedom + 3) / (s.freedom + surprise)
+    weighted = np.einsum("pcu,pcd->pud", derivative, precision * trust[:, None, None])
+    hessian = np.einsum("pud,pdv->uv", weighted, derivative) + problem.precision
+    gradient = np.einsum("pud,pd->u", weighted, residual) - problem.precision @ u
+    return hessian, gradient
