@@ -256,14 +256,16 @@ def estimate_maps(
                 progress=lambda i, e: stage.progress(f"refine: step {i}, photo error {e:.4f}"),
             )  # fmt: skip
         elif any(e.interrupted for e in estimates):
-            left = prior.sigma if prior.total is None else prior.total
-            result = Refined(to_maps(prior.mean), left, interrupted=True)
+            result = Refined(to_maps(prior.mean), prior.expected, interrupted=True)
         else:
             known = share(photos, prior, samples=samples)
             photos = known.observations
-            result = explain(photos, known.prior, samples=samples)
+            if known.interrupted:
+                result = Refined(to_maps(known.prior.mean), known.prior.expected, interrupted=True)
+            else:
+                result = explain(photos, known.prior, samples=samples)
+                result.converged &= known.converged
             result.factors = known.factors
-            result.converged &= known.converged
     return starts[0], result, photos
 
 

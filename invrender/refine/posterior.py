@@ -129,7 +129,7 @@ def explain(
     """
     began = time.perf_counter()
     theta = project(prior.mean.copy())
-    left = (prior.sigma if prior.total is None else prior.total).copy()
+    left = prior.expected.copy()
     readings = read_materials(theta, s)
     squares, seen, interrupted = 0.0, 0, False
     try:

@@ -53,6 +53,11 @@ class Prior:
     correlation: Array
     total: Array | None = None
 
+    @property
+    def expected(self) -> Array:
+        """The expected errors (H, W, 9)."""
+        return self.sigma if self.total is None else self.total
+
 
 def lobe_prior(maps: Maps, spreads: Spreads = WITHIN_MATERIAL) -> Prior:
     """The uncertainty within a material of maps from `invrender.refine.lobes`: mostly shade and
@@ -109,6 +114,6 @@ def pooled(priors: Sequence[Prior]) -> Prior:
     precision = [1 / p.sigma**2 for p in priors]
     sum_ = np.sum(precision, 0)
     mean = np.sum([w * p.mean for w, p in zip(precision, priors, strict=True)], 0) / sum_
-    totals = [p.sigma if p.total is None else p.total for p in priors]
+    totals = [p.expected for p in priors]
     total = np.sqrt(len(priors) / np.sum([1 / t**2 for t in totals], 0))
     return Prior(mean, np.sqrt(len(priors) / sum_), priors[0].correlation, total)

@@ -24,16 +24,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 from scipy.cluster.vq import kmeans2
 
-from invrender.refine.gauss_newton import Observation, linearise
+from invrender.refine.gauss_newton import BAND, Observation, linearise
 from invrender.refine.priors import Prior
 from invrender.refine.theta import D, N, R, S, project
 from invrender.types import Array
 
 UNKNOWNS = 7  # of a material: what θ has but slopes
+KNOWN = (0.0, 0.0)  # doubt of lights that are known
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,8 @@ class Settings:
     steps: int = 5
     settled: float = 0.3  # decrease of the cost, -2 log posterior, that ends the steps
     longest: float = 0.1  # step of roughness
+    shorter: tuple[float, ...] = (1.0, 1 / 3, 1 / 9)  # of a step that would raise the cost
+    least_fill: float = 0.05  # of a part that a material has
     # what a material is off by
     shared_diffuse: tuple[float, float] = (0.01, 0.1)
     shared_specular: tuple[float, float] = (0.004, 0.2)
@@ -74,8 +79,9 @@ class Settings:
     mirror_weight: float = 1.5  # of sqrt(f0)
     alike_distance: float = 0.12  # of groups that are one
     softness: float = 0.05  # deviation of a pixel from its group
+    jitter: float = 1e-4  # of pixels, so that no two are the same
     least_part: float = 0.02  # of the sample that a group has
-    shared_share: float = 0.5  # of a network's squared error that a material shares
+    shared_error: float = 0.5  # of a network's squared error that a material shares
 
 
 SETTINGS = Settings()
@@ -92,6 +98,7 @@ class Shared:
     factors: list[tuple[Array, Array]] = field(default_factory=list)
     converged: bool = True
     misfit: float = 0.0
+    interrupted: bool = False
 
 
 def share(
@@ -104,29 +111,32 @@ def share(
     theta = plain_dielectric(project(prior.mean.copy()), s)
     centres = group(theta[_grid(theta, s)], s)
     problem = _Problem(observations, prior, theta, centres, samples, s)
-    solution, covariance, misfit, converged = _solve(problem, s)
-    weight = belongs(theta, centres, s)
-    z, rest = problem.offsets(solution, covariance)
-    theta[..., :UNKNOWNS] += shared_sigma(theta, s) * (weight @ z)
-    total = prior.sigma if prior.total is None else prior.total
-    less = 1 - s.shared_share * np.clip(weight @ (1 - rest), 0, 1)
-    total = total.copy()
-    total[..., :UNKNOWNS] *= np.sqrt(less)
-    factors = problem.factors(solution)
+    solved = _solve(problem, s)
+    z, left = problem.offsets(solved.u, solved.covariance)
+    total = prior.expected.copy()
+    rows = max(1, BAND // theta.shape[1])
+    for top in range(0, len(theta), rows):
+        part = slice(top, top + rows)
+        weight = belongs(theta[part], centres, s)
+        less = 1 - s.shared_error * np.clip(weight @ (1 - left), 0, 1)
+        total[part, :, :UNKNOWNS] *= np.sqrt(less)
+        theta[part, :, :UNKNOWNS] += shared_sigma(theta[part], s) * (weight @ z)
+        project(theta[part])
+    factors = problem.factors(solved.u)
     shots = [
-        o if o.doubt == (0, 0) else replace(o, renderer=o.renderer.scaled(*f))
+        o if o.doubt == KNOWN else replace(o, renderer=o.renderer.scaled(*f))
         for o, f in zip(observations, factors, strict=True)
     ]
     return Shared(
-        replace(prior, mean=project(theta.astype(np.float32)), total=total),
-        shots, factors, converged, misfit,
+        replace(prior, mean=theta, total=total), shots, factors,
+        solved.converged, solved.misfit, solved.interrupted,
     )  # fmt: skip
 
 
 def light_doubt(fit: dict[str, float], s: Settings = SETTINGS) -> tuple[float, float]:
     """Deviations of the logarithms of screen and room, by `Lights.fit`; nought of known lights."""
     if not fit:
-        return 0.0, 0.0
+        return KNOWN
     room = s.room_doubt + s.raised_doubt * float(np.log(max(fit.get("room_raised", 1.0), 1.0)))
     room += s.hidden_doubt * (fit.get("hidden_lamp", 1.0) > 1)
     return max(float(fit.get("residual", 0.0)), s.least_doubt), room
@@ -172,7 +182,9 @@ def group(theta: Array, s: Settings = SETTINGS) -> Array:
     mean = points.mean(0, keepdims=True)
     if len(points) < s.materials or points.std(0).max() < s.softness:
         return mean
-    centres, label = kmeans2(points, s.materials, minit="++", rng=np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    points += s.jitter * rng.standard_normal(points.shape)
+    centres, label = kmeans2(points, s.materials, minit="++", rng=rng)
     shares = np.bincount(label, minlength=len(centres)) / len(points)
     kept: list[Array] = []
     for k in np.argsort(-shares):
@@ -214,10 +226,10 @@ class _Problem:
             np.ones(self.theta.shape[:2]) if o.clipped is None else ~o.clipped[at] * 1.0
             for o in observations
         ]
-        self.dark = [None if o.doubt == (0, 0) else o.renderer.scaled(0.0, 1.0)
+        self.dark = [None if o.doubt == KNOWN else o.renderer.scaled(0.0, 1.0)
                      for o in observations]  # fmt: skip
         self.shared = shared_sigma(self.theta, s)
-        total = (prior.sigma if prior.total is None else prior.total)[at]
+        total = prior.expected[at]
         own = _sigma(self.theta, s.part_diffuse, s.part_specular, s.part_roughness, s)
         least, of = s.part_slope
         slopes = np.maximum(least, of * total[..., N])
@@ -262,12 +274,12 @@ class _Problem:
 
     def factors(self, u: Array) -> list[tuple[Array, Array]]:
         """Of each photo's screen and room, RGB."""
-        one = np.ones(3, np.float32)
-        return [
-            (one, one) if i not in self.light
-            else tuple(np.exp(u[self.light[i] :][:6]).astype(np.float32).reshape(2, 3))
-            for i in range(len(self.observations))
-        ]  # fmt: skip
+        found = []
+        for i in range(len(self.observations)):
+            logs = u[self.light[i] :][:6] if i in self.light else np.zeros(6)
+            screen, room = np.exp(logs).astype(np.float32).reshape(2, 3)
+            found.append((screen, room))
+        return found
 
     def offsets(self, u: Array, covariance: Array) -> tuple[Array, Array]:
         """z (materials, 7) without what relief makes of roughness, and the share of the prior's
@@ -299,9 +311,8 @@ class _Problem:
             room = linearise(dark, theta, self.samples)[0]
             screen = factors[0] * (image - room)
             room = factors[1] * room
-            jacobian *= ((screen + room) / np.maximum(image, 1e-12 * image.mean() + 1e-30))[
-                ..., None
-            ]
+            brighter = (screen + room) / np.maximum(image, 1e-12 * image.mean() + 1e-30)
+            jacobian *= brighter[..., None]
             image = screen + room
             for c in range(3):
                 lights[..., c, c], lights[..., c, 3 + c] = screen[..., c], room[..., c]
@@ -313,13 +324,8 @@ class _Problem:
             weight = (self.weight[..., k] * self.seen[i]).ravel()
             fill = np.bincount(self.part, weight, self.parts)
             full = np.bincount(self.part, minlength=self.parts)
-            kept = fill > 0.05 * full
-
-            def means(x: Array, weight: Array = weight, fill: Array = fill, kept: Array = kept):
-                columns = x.reshape(len(weight), -1).T
-                sums = [np.bincount(self.part, weight * c, self.parts)[kept] for c in columns]
-                return (np.array(sums) / fill[kept]).T.reshape(-1, *x.shape[2:])
-
+            kept = fill > s.least_fill * full
+            means = partial(_means, part=self.part, weight=weight, fill=fill, kept=kept)
             derivative = np.zeros((int(kept.sum()), 3, self.size))
             at = slice(k * UNKNOWNS, (k + 1) * UNKNOWNS)
             derivative[..., at] = means(shared) * self.apparent[k]
@@ -334,39 +340,62 @@ class _Problem:
         return tuple(np.concatenate(x) for x in zip(*parts, strict=True))
 
 
-def _solve(problem: _Problem, s: Settings) -> tuple[Array, Array, float, bool]:
-    """The unknowns of least cost, their covariance, the parts' misfit, whether steps ended by
-    themselves."""
-    n = problem.materials * UNKNOWNS
+def _means(image: Array, part: Any, weight: Array, fill: Any, kept: Any) -> Array:
+    """Weighted means (P, ...) of an image (H, W, ...) over the parts that are kept."""
+    columns = image.reshape(len(weight), -1).T
+    sums = [np.bincount(part, weight * c, len(fill))[kept] for c in columns]
+    return (np.array(sums) / fill[kept]).T.reshape(-1, *image.shape[2:])
 
-    def cost_of(u: Array, found: tuple[Array, Array, Array]) -> tuple[float, Array]:
-        surprise = np.einsum("pc,pcd,pd->p", found[0], found[2], found[0])
+
+@dataclass
+class _Solution:
+    """The unknowns of least cost and their covariance; the rest as in `Shared`."""
+
+    u: Array
+    covariance: Array
+    converged: bool = False
+    misfit: float = 0.0
+    interrupted: bool = False
+
+
+def _solve(problem: _Problem, s: Settings) -> _Solution:
+    n = problem.materials * UNKNOWNS
+    found = _Solution(np.zeros(problem.size), np.linalg.inv(problem.precision))
+
+    def cost_of(u: Array, seen: tuple[Array, Array, Array]) -> tuple[float, Array]:
+        surprise = np.einsum("pc,pcd,pd->p", seen[0], seen[2], seen[0])
         cost = (s.freedom + 3) * np.log1p(surprise / s.freedom).sum() + u @ problem.precision @ u
         return float(cost), surprise
 
-    u = np.zeros(problem.size)
-    found = problem.evaluate(u)
-    cost, surprise = cost_of(u, found)
-    converged = False
-    for _ in range(s.steps):
-        hessian, gradient = _normal(problem, u, found, surprise, s)
-        step = np.linalg.solve(hessian, gradient)
-        rho = step[:n].reshape(-1, UNKNOWNS)[:, R] * problem.apparent[:, R] * s.shared_roughness
-        step *= min(1.0, s.longest / max(float(np.abs(rho).max()), 1e-9))
-        for shorter in (1.0, 1 / 3, 1 / 9):
-            trial = problem.evaluate(u + shorter * step)
-            new, unlikely = cost_of(u + shorter * step, trial)
-            if new < cost:
+    try:
+        u = found.u
+        seen = problem.evaluate(u)
+        if len(seen[0]) == 0:  # all is saturated
+            return replace(found, converged=True)
+        cost, surprise = cost_of(u, seen)
+        for _ in range(s.steps):
+            hessian, gradient = _normal(problem, u, seen, surprise, s)
+            step = np.linalg.solve(hessian, gradient)
+            rho = step[:n].reshape(-1, UNKNOWNS)[:, R] * problem.apparent[:, R]
+            step *= min(1.0, s.longest / max(float(np.abs(s.shared_roughness * rho).max()), 1e-9))
+            for shorter in s.shorter:
+                trial = problem.evaluate(u + shorter * step)
+                new, unlikely = cost_of(u + shorter * step, trial)
+                if new < cost:
+                    break
+            else:
+                found.converged = True
                 break
-        else:
-            converged = True
-            break
-        converged = cost - new < s.settled
-        u, found, surprise, cost = u + shorter * step, trial, unlikely, new
-        if converged:
-            break
-    covariance = np.linalg.inv(_normal(problem, u, found, surprise, s)[0])
-    return u, covariance, float(surprise.mean() / 3 / s.independent), converged
+            found.converged = cost - new < s.settled
+            u, seen, surprise, cost = u + shorter * step, trial, unlikely, new
+            found.u = u
+            if found.converged:
+                break
+        found.covariance = np.linalg.inv(_normal(problem, u, seen, surprise, s)[0])
+        found.misfit = float(surprise.mean() / 3 / s.independent)
+    except KeyboardInterrupt:
+        found.interrupted = True
+    return found
 
 
 def _normal(

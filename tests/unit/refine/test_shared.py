@@ -17,7 +17,7 @@ from invrender.sphere import scale_environment
 
 SIZE = 32
 ROOM = scale_environment(procedural_environment(3, 64), 0.3)
-SIGMA = {"diffuse": 0.05, "specular": 0.05, "roughness": 0.08, "normal": 0.01}
+SIGMA = {"diffuse": 0.05, "specular": 0.05, "roughness": 0.08, "normal": 0.001}
 
 
 def under(gain=2.0, room=1.0):
