@@ -84,7 +84,7 @@ class Settings:
     shared_error: float = 0.5  # of a network's squared error that a material shares
 
 
-SETTINGS = Settings()
+SHARED_SETTINGS = Settings()
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,11 @@ class Shared:
 
 
 def share(
-    observations: Sequence[Observation], prior: Prior, *, samples: int = 64, s: Settings = SETTINGS
+    observations: Sequence[Observation],
+    prior: Prior,
+    *,
+    samples: int = 64,
+    s: Settings = SHARED_SETTINGS,
 ) -> Shared:
     """The prior and the lights after what all pixels tell together.
 
@@ -133,7 +137,7 @@ def share(
     )  # fmt: skip
 
 
-def light_doubt(fit: dict[str, float], s: Settings = SETTINGS) -> tuple[float, float]:
+def light_doubt(fit: dict[str, float], s: Settings = SHARED_SETTINGS) -> tuple[float, float]:
     """Deviations of the logarithms of screen and room, by `Lights.fit`; nought of known lights."""
     if not fit:
         return KNOWN
@@ -142,7 +146,7 @@ def light_doubt(fit: dict[str, float], s: Settings = SETTINGS) -> tuple[float, f
     return max(float(fit.get("residual", 0.0)), s.least_doubt), room
 
 
-def plain_dielectric(theta: Array, s: Settings = SETTINGS) -> Array:
+def plain_dielectric(theta: Array, s: Settings = SHARED_SETTINGS) -> Array:
     """Maps θ in which every dielectric has the sample's median f0, grey; in place."""
     f0 = theta[..., S].mean(-1)
     low, high = s.dielectric_f0
@@ -153,7 +157,7 @@ def plain_dielectric(theta: Array, s: Settings = SETTINGS) -> Array:
     return theta
 
 
-def shared_sigma(theta: Array, s: Settings = SETTINGS) -> Array:
+def shared_sigma(theta: Array, s: Settings = SHARED_SETTINGS) -> Array:
     """Deviations (H, W, 7) of what a material is off by."""
     return _sigma(theta, s.shared_diffuse, s.shared_specular, s.shared_roughness, s)
 
@@ -176,7 +180,7 @@ def _features(theta: Array, s: Settings) -> Array:
     return np.concatenate([np.sqrt(theta[..., D]), mirror, theta[..., R : R + 1]], -1)
 
 
-def group(theta: Array, s: Settings = SETTINGS) -> Array:
+def group(theta: Array, s: Settings = SHARED_SETTINGS) -> Array:
     """Centres (materials, 5) of like pixels of maps θ."""
     points = _features(theta, s).reshape(-1, 5).astype(np.float64)
     mean = points.mean(0, keepdims=True)
@@ -194,7 +198,7 @@ def group(theta: Array, s: Settings = SETTINGS) -> Array:
     return np.array(kept)
 
 
-def belongs(theta: Array, centres: Array, s: Settings = SETTINGS) -> Array:
+def belongs(theta: Array, centres: Array, s: Settings = SHARED_SETTINGS) -> Array:
     """How much each pixel is of each material (H, W, materials), together one."""
     apart = ((_features(theta, s)[..., None, :] - centres) ** 2).sum(-1)
     weight = np.exp((apart.min(-1, keepdims=True) - apart) / (2 * s.softness**2))
