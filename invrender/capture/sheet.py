@@ -618,7 +618,7 @@ def use_paper(
         text = (
             f"measured by the capture sheet, the ball's radius is {1000 * ball.radius_m:.2f} mm, "
             f"not {1000 * lights.rig.ball_radius:.2f}: either the sheet was printed at "
-            f"{1 / ratio:.0%} of its size (its line of 100 mm tells) or [ball] radius is wrong"
+            f"{1 / ratio:.0%} of its size (the line in its window tells) or [ball] radius is wrong"
         )
         notices.append(Notice("sheet-scale", text))
     measured = screen_gain(sheet, lights)

@@ -1,4 +1,4 @@
-"""The capture guide: two pages of A4, the rig drawn to scale and a template in its real size."""
+"""The capture guide: the rig drawn to scale on A4, and the capture sheet in its real size."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import numpy as np
 
 from invrender.files.write import atomic_path
 from invrender.rig import Rig
+from invrender.sheet import Sheet, capture_sheet, marker_bits
+from invrender.types import InputError
 
 MM = 1 / 25.4  # inches
 PAGE = (210.0, 297.0)  # A4, mm
@@ -17,18 +19,32 @@ MARGIN = 15.0
 SCALES = (1, 2, 2.5, 5, 10, 20, 50, 100)
 INK, SOFT, SCREEN, BALL = "#1c1d20", "#74767c", "#2f6fb0", "#b04a2f"
 DIAGONAL = math.hypot(36, 24)  # mm, of the 35 mm frame
+LINES = (100, 50, 20, 10, 5)  # mm, to check the printer's scale by
+DOTS = 20  # image pixels in a marker's module, so that no viewer blurs it
 
 
 def write_guide(path: Path, rig: Rig) -> None:
-    """Write the guide of a ``rig`` as a PDF; its drawing's scale is printed on it."""
+    """Write the guide of a ``rig`` as a PDF: its drawing's scale is printed on it, and the capture
+    sheet is as large as paper of A4 and Letter, or of A3 and Ledger, have in common."""
     from matplotlib.backends.backend_pdf import PdfPages
     from matplotlib.figure import Figure
 
     with atomic_path(path) as temporary, PdfPages(temporary) as pdf:
-        for draw in (_guide, _template):
+        figure = Figure(figsize=(PAGE[0] * MM, PAGE[1] * MM))
+        _guide(figure, rig)
+        pdf.savefig(figure)
+        try:
+            sheet = capture_sheet(rig)
+        except InputError as error:
             figure = Figure(figsize=(PAGE[0] * MM, PAGE[1] * MM))
-            draw(figure, rig)
-            pdf.savefig(figure)
+            page = _axes(figure, 0, 0, 1)
+            page.text(MARGIN, -20, "No capture sheet", size=17, weight="bold", color=INK)
+            page.text(MARGIN, -30, f"{error}.\nMeasure from page 1.", size=8, color=INK)
+        else:
+            x0, y0, x1, y1 = sheet.page
+            figure = Figure(figsize=(1000 * (x1 - x0) * MM, 1000 * (y1 - y0) * MM))
+            _sheet(figure, sheet)
+        pdf.savefig(figure)
         pdf.infodict()["Title"] = "invrender: capture guide"
 
 
@@ -108,9 +124,10 @@ def _guide(figure: Any, rig: Rig) -> None:
     y = -(y1 + l / 2 / scale + 16)
     fov, focal = rig.fov, needed_focal(rig)
     for i, line in enumerate((
-        "Lay the sample flat, stand the ball beside it; page 2 is a template for both.",
-        "On a sample larger than its square lay page 2 with the square cut out: its edge tells "
-        "where the camera was.",
+        "Page 2 is the capture sheet: its markers tell where the camera was, its white paper how "
+        "bright the light is.",
+        "Lay it on the sample, its square cut out, or the sample on it. The ball stands on its "
+        "cross.",
         "Show the pattern at its real size and full brightness; switch off automatic brightness, "
         "night light and tone adaptation.",
         f"Hold the display {h:.0f} mm above the table, face down and level, its top edge where the "
@@ -129,32 +146,42 @@ def _guide(figure: Any, rig: Rig) -> None:
         text(MARGIN + 6, y - 5.1 * i, line, size=8.2, color=INK)
 
 
-def _template(figure: Any, rig: Rig) -> None:
-    """The places of sample and ball in real size, and a line to check the printer's scale by."""
-    half, r = 500 * rig.sample_size, 1000 * rig.ball_radius
-    axis = 1000 * rig.optical_axis_x
-    page = _axes(figure, 0, 0, 1)
-    page.text(MARGIN, -20, "Template, 1 : 1", size=17, weight="bold", color=INK)
-    page.text(MARGIN, -26, "Print at 100%, not fitted to the page; the line below is 100 mm long.",
-              size=9, color=SOFT)  # fmt: skip
-    _length(page, (MARGIN, -36), (MARGIN + 100, -36), "100", 1)
-    width = half + axis + r
-    if width > PAGE[0] - 2 * MARGIN or max(2 * half, 2 * r) > PAGE[1] - 80:
-        page.text(MARGIN, -60, "This rig does not fit on A4: measure from page 1.", size=11)
-        return
-    place = _axes(figure, (PAGE[0] - width) / 2 + half, 60 + max(half, r), 1)
-    # Corners only: a line along the sample's border would hide its edge.
-    for sx in (-1, 1):
-        for sy in (-1, 1):
-            place.plot([sx * half, sx * half, sx * (half - 8)],
-                       [sy * (half - 8), sy * half, sy * half], color=SOFT, lw=0.6)  # fmt: skip
-    name = f"sample\n{2 * half:.0f} × {2 * half:.0f} mm"
-    place.text(0, 0, name, ha="center", va="center", size=9, color=SOFT)
+def _sheet(figure: Any, sheet: Sheet) -> None:
+    """The sheet's markers, window and ball in real size; what is to be read stands in the window,
+    which is cut out or covered."""
+    x0, y0, x1, y1 = (1000 * v for v in sheet.page)
+    page = figure.add_axes((0, 0, 1, 1))
+    page.set_axis_off()
+    for bits, square in zip(marker_bits(sheet.ids), 1000 * sheet.corners, strict=True):
+        (left, top), (right, bottom) = square[0], square[2]
+        image = np.kron(bits, np.ones((DOTS, DOTS)))
+        page.imshow(image, cmap="gray", vmin=0, vmax=1, extent=(left, right, bottom, top),
+                    interpolation="none", aspect="auto")  # fmt: skip
+    half = 500 * sheet.window
+    _rectangle(page, -half, -half, 2 * half, 2 * half, SOFT, lw=0.4)
+    size = min(9.0, half / 5.5)  # points: all lines fit into the window
+    mm = f"{2 * half:.4g}"
+    lines = (
+        "Capture sheet",
+        f"Print at 100% on {sheet.paper}.",
+        f"Cut out this square ({mm} × {mm} mm) and lay the sheet on the",
+        "sample; or lay a sample of its size on it.",
+        "The ball stands on the cross, the lens is above it.",
+        "Leave the markers and the white paper uncovered.",
+        "← display                                  lens and ball →",
+    )
+    for i, line in enumerate(lines):
+        page.text(0, half * (0.75 - 0.2 * i), line, ha="center", va="center", size=size, color=INK,
+                  weight="bold" if i == 0 else "normal")  # fmt: skip
+    length = next((n for n in LINES if n < 1.8 * half), LINES[-1])
+    _length(page, (-length / 2, -0.75 * half), (length / 2, -0.75 * half), f"{length} mm", 1)
+    x, y, r = (1000 * v for v in sheet.ball)
     turn = np.linspace(0, 2 * math.pi, 90)
-    place.plot(axis + 0.9 * r * np.cos(turn), 0.9 * r * np.sin(turn), color=SOFT, lw=0.4)
-    place.plot([axis - 3, axis + 3], [0, 0], color=SOFT, lw=0.4)
-    place.plot([axis, axis], [-3, 3], color=SOFT, lw=0.4)
-    place.text(axis, -half + 2, "ball on\nthe cross", ha="center", va="bottom", size=9, color=SOFT)
+    page.plot(x + 0.9 * r * np.cos(turn), y + 0.9 * r * np.sin(turn), color=SOFT, lw=0.4)
+    page.plot([x - 0.3 * r, x + 0.3 * r], [y, y], color=SOFT, lw=0.4)
+    page.plot([x, x], [y - 0.3 * r, y + 0.3 * r], color=SOFT, lw=0.4)
+    page.set_xlim(x0, x1)
+    page.set_ylim(y0, y1)
 
 
 def _rectangle(

@@ -6,9 +6,12 @@ import argparse
 import re
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from chromium import CHROMIUM, Page
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from PIL import Image
 from rich.console import Console
 
@@ -16,6 +19,7 @@ from invrender.cli.pattern import add_parser
 from invrender.data.environments import procedural_environment
 from invrender.files.images import read_image
 from invrender.files.rig_toml import write_rig
+from invrender.files.write import INCH
 from invrender.pattern.default import block_pattern, default_pattern, mirrored
 from invrender.pattern.design import (
     DARKEST,
@@ -30,9 +34,10 @@ from invrender.pattern.design import (
 )
 from invrender.pattern.design.population import _shade
 from invrender.pattern.display import pattern_page
-from invrender.pattern.guide import needed_focal
+from invrender.pattern.guide import _sheet, needed_focal
 from invrender.rig import Rig
 from invrender.sampling import resize_pattern
+from invrender.sheet import capture_sheet, marker_dictionary
 from invrender.sphere import scale_environment
 from invrender.types import InputError
 
@@ -259,16 +264,32 @@ def test_impossible_devices_are_refused(words, match, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_guide_is_two_pages_of_a4_for_any_rig(tmp_path):
-    for k, rig in enumerate((RIG, replace(RIG, screen_size=0.5, screen_height=0.7))):
+def test_guide_is_two_pages_for_any_rig(tmp_path):
+    second = ((279.4, 210), (210, 297))  # the capture sheet, or that there is none so large
+    for size, rig in zip(second, (RIG, Rig(screen_size=0.5, screen_height=0.7)), strict=True):
         write_rig(tmp_path / "rig.toml", rig)
-        out = tmp_path / f"{k}.pdf"
+        out = tmp_path / "guide.pdf"
         assert run("-o", out, "--rig", tmp_path / "rig.toml") == 0
         pages = re.findall(rb"/MediaBox \[ *0 0 ([\d.]+) ([\d.]+)", out.read_bytes())
-        assert len(pages) == 2
-        assert [float(p) / 72 * 25.4 for p in pages[0]] == pytest.approx((210, 297), abs=0.1)
+        millimetres = [[float(p) / 72 * 25.4 for p in page] for page in pages]
+        assert millimetres == [pytest.approx((210, 297), abs=0.1), pytest.approx(size, abs=0.1)]
     # A 24 mm lens has a field of 71.6° across a 4:3 photo; the default sample needs 70° of it.
     assert needed_focal(RIG) == pytest.approx(23.6, abs=0.1)
+
+
+def test_the_printed_sheet_is_the_one_that_is_looked_for():
+    sheet, dots = capture_sheet(RIG), 200  # an inch
+    x0, y0, x1, y1 = sheet.page
+    figure = Figure(figsize=((x1 - x0) / INCH, (y1 - y0) / INCH), dpi=dots)
+    canvas = FigureCanvasAgg(figure)
+    _sheet(figure, sheet)
+    canvas.draw()
+    image = np.asarray(canvas.buffer_rgba())[..., 1]
+    quads, ids, _ = cv2.aruco.ArucoDetector(marker_dictionary()).detectMarkers(image)
+    assert sorted(ids.ravel()) == sorted(sheet.ids)
+    for number, quad in zip(ids.ravel(), quads, strict=True):
+        at = (quad[0].mean(0) + 0.5) * INCH / dots * [1, -1] + [x0, y1]
+        assert at == pytest.approx(sheet.corners[number - sheet.ids[0]].mean(0), abs=2e-4)
 
 
 def test_page_is_one_file_of_the_rigs_size(tmp_path):
