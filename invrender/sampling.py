@@ -43,10 +43,10 @@ def _weights(old: int, new: int) -> csr_array:
 
 
 def resize_pattern(pattern: NDArray[Any], size: int) -> NDArray[np.float32]:
-    """A square pattern (P, P, 3) at (size, size, 3): bilinear to more pixels, means over the new
-    pixels' areas to fewer."""
-    weights = _resampling(len(pattern), size)
-    out = np.einsum("ir,jc,rcd->ijd", weights, weights, pattern, optimize=True)
+    """A pattern (h, w, 3) at (size, size, 3): bilinear to more pixels, means over the new pixels'
+    areas to fewer."""
+    rows, columns = (_resampling(n, size) for n in pattern.shape[:2])
+    out = np.einsum("ir,jc,rcd->ijd", rows, columns, pattern, optimize=True)
     return np.clip(out, 0, 1).astype(np.float32)
 
 

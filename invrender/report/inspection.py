@@ -68,10 +68,9 @@ def summary(found: FoundLights) -> dict[str, Any]:
 
 def pattern_share(lights: Lights) -> float:
     """Share of the light on the middle of the sample that comes from the screen, in [0, 1]."""
-    shown = resize_pattern(lights.pattern, 32).mean(-1)
-    screen = float(
-        np.mean(lights.gain) * (shown * lights.rig.screen_cosines(np.zeros(3), 32)).sum()
-    )
+    shown = resize_pattern(lights.shown, 32).mean(-1)
+    weights = lights.rig.screen_cosines(np.zeros(3), 32, lights.device.falloff)
+    screen = float(np.mean(lights.gain) * (shown * weights).sum())
     room = float(irradiance(lights.environment).mean())
     return screen / max(screen + room, 1e-30)
 

@@ -91,6 +91,9 @@ def test_resizing_keeps_the_mean(size):
     assert pattern.shape == (size, size, 3)
     assert np.allclose(pattern.mean((0, 1)), block_pattern(256).mean((0, 1)), atol=2e-3)
     assert np.allclose(resize_pattern(np.full((9, 9, 3), 0.3), size), 0.3, atol=1e-6)
+    wide = resize_pattern(block_pattern(256)[:, ::2], size)
+    assert wide.shape == (size, size, 3)
+    assert np.allclose(wide.mean((0, 1)), block_pattern(256).mean((0, 1)), atol=2e-3)
 
 
 def test_resizing_up_is_bilinear_between_centres():
