@@ -6,11 +6,13 @@ they and the sample exchange. The sample's BSDF is a plugin that calls `invrende
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 
 from invrender.device import IDEAL, Device
+from invrender.lights import Lights
 from invrender.maps import Maps
 from invrender.render import brdf
 from invrender.render.backend import BACKEND, dr
@@ -228,21 +230,55 @@ def sample_scene(
 
     The same bilinear pattern and environment, the same pixel-wise constant material.
     """
-    half = rig.sample_size / 2
+    emission = {"emitter_samples": 2, "bsdf_samples": 1}
+    choice = emission if integrator == "direct" else {"max_depth": max_depth}
     return mi.load_dict(
         {
             "type": "scene",
-            "integrator": {"type": integrator, "max_depth": max_depth}
-            if integrator != "direct"
-            else {"type": "direct", "emitter_samples": 2, "bsdf_samples": 1},
-            "sample": {
-                "type": "rectangle",
-                "to_world": mi.ScalarTransform4f().scale([half, half, 1]),
-                "bsdf": _bsdf(maps),
-            },
+            "integrator": {"type": integrator, **choice},
+            "sample": _sample(rig, maps),
             **_lights(rig, pattern, environment, gain, device),
         }
     )
+
+
+def scene_dict(maps: Maps, lights: Lights, *, samples: int = 64) -> dict[str, Any]:
+    """The sample under its lights as a description for `mitsuba.load_dict`.
+
+    Its BSDF is ours, a plugin that this module registers, whose maps are parameters that carry
+    gradients (``sample.bsdf.diffuse`` and so on). Its sensor sees what `invrender.render` renders:
+    the sample alone, from the camera, a pixel a texel.
+    """
+    rig, (height, width) = lights.rig, maps.shape
+    x, y, z = (float(c) for c in rig.camera)
+    down = [np.array(c, float) for c in ([-1, 0, 0], [0, 1, 0], [0, 0, -1], [x, y, z])]
+    return {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 2},
+        "sensor": {
+            "type": "perspective",
+            "fov": math.degrees(2 * math.atan(rig.sample_size / 2 / z)),
+            "fov_axis": "x",
+            "principal_point_offset_x": -x / rig.sample_size,
+            "principal_point_offset_y": y / rig.sample_size,
+            "near_clip": 1e-3 * z,
+            "far_clip": 1e3 * z,
+            "to_world": _transform(down),
+            "film": {
+                "type": "hdrfilm", "width": width, "height": height, "pixel_format": "rgb",
+                "component_format": "float32", "rfilter": {"type": "box"},
+            },
+            "sampler": {"type": "multijitter", "sample_count": samples},
+        },
+        "sample": _sample(rig, maps),
+        **_lights(rig, lights.pattern, lights.environment, lights.gain, lights.device),
+    }  # fmt: skip
+
+
+def _sample(rig: Rig, maps: Maps) -> dict[str, Any]:
+    half = rig.sample_size / 2
+    place = mi.ScalarTransform4f().scale([half, half, 1])
+    return {"type": "rectangle", "to_world": place, "bsdf": _bsdf(maps)}
 
 
 def _bsdf(maps: Maps) -> dict[str, Any]:
@@ -370,7 +406,7 @@ def photograph(
     table under the sample, its reflectance (h, w), row 0 at +y, and its least x, least y, greatest
     x and greatest y.
     """
-    half, size = rig.sample_size / 2, max(rig.screen_sides)
+    size = max(rig.screen_sides)
     camera, (right, up, back) = rig.camera, rig.camera_axes
     table = np.broadcast_to(np.asarray(table, dtype=float), 3)
     scene = mi.load_dict(
@@ -395,11 +431,7 @@ def photograph(
                 },
                 "sampler": {"type": "multijitter", "sample_count": spp},
             },
-            "sample": {
-                "type": "rectangle",
-                "to_world": mi.ScalarTransform4f().scale([half, half, 1]),
-                "bsdf": _bsdf(maps),
-            },
+            "sample": _sample(rig, maps),
             "table": {
                 "type": "rectangle",
                 "to_world": mi.ScalarTransform4f()

@@ -7,6 +7,7 @@ import os
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -56,6 +57,16 @@ class Result:
         from invrender.render.image import render
 
         return render(self.maps, lights or self.lights, samples=samples, seed=seed)
+
+    def mitsuba_scene(self) -> dict[str, Any]:
+        """The sample under its lights, a description for `mitsuba.load_dict`; see
+        `invrender.render.path_traced.scene_dict`.
+
+            scene = mitsuba.load_dict(result.mitsuba_scene())
+        """
+        from invrender.render.path_traced import scene_dict
+
+        return scene_dict(self.maps, self.lights)
 
     def save(self, folder: str | Path) -> None:
         """Write all of it to a folder (docs: "A result's files"), whole or not at all.

@@ -57,3 +57,30 @@ def test_table_and_ball_only_add_light():
     whole = photograph.photograph(rig, maps, pattern, env, max_depth=5, table=0.3, **kw)
     a, b = sample_region(rig, direct, 8).mean(), sample_region(rig, whole, 8).mean()
     assert 0.97 < b / a < 1.1, b / a
+
+
+def test_a_result_is_a_mitsuba_scene_in_one_call():
+    """What Mitsuba renders of its description is what `render` renders, the camera off its place;
+    its maps carry gradients."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from invrender.lights import Lights
+    from invrender.maps import NAMES
+    from invrender.render.image import render
+
+    rig = Rig(camera_shift=(0.004, -0.006, 0.01), camera_tilt=(3.0, -2.0, 1.0))
+    maps = some_maps(16, "glossy")
+    lights = Lights(rig, some_pattern(), some_environment(sun=0), gain=3.0)
+    scene = mi.load_dict(photograph.scene_dict(maps, lights, samples=512))
+    image = np.array(mi.render(scene))
+    ours = render(maps, lights)
+    # Mitsuba averages over a pixel, ours is at its centre.
+    assert np.abs(image - ours).mean() < 0.03 * ours.mean()
+    parameters = mi.traverse(scene)
+    keys = [f"sample.bsdf.{name}" for name in NAMES]
+    assert set(keys) <= set(parameters.keys())
+    dr.enable_grad(parameters[keys[0]])
+    parameters.update()
+    dr.backward(dr.mean(mi.render(scene, parameters, spp=4)))
+    assert np.abs(np.array(dr.grad(parameters[keys[0]]))).max() > 0

@@ -63,6 +63,22 @@ def test_commands_find_their_data(installed):
     assert run(python, "-c", where, cwd=installed).stdout.count(str(installed)) == 2
 
 
+def test_the_app_finds_its_page(installed):
+    """All that the page loads is in the wheel."""
+    python = installed / "env" / "bin" / "python"
+    program = (
+        "from importlib.resources import files as f\n"
+        "import invrender.app.serve\n"
+        "page = {p.name for p in (f('invrender.app') / 'page').iterdir()}\n"
+        "assert {'index.html', 'app.css', 'app.js', 'icon.svg', 'tablet.js'} <= page, page\n"
+        "assert (f('invrender.report') / 'templates' / 'viewer.js').is_file()\n"
+    )
+    done = run(python, "-c", program, cwd=installed)
+    assert done.returncode == 0, done.stderr
+    help = run(installed / "env" / "bin" / "invrender", "app", "--help", cwd=installed)
+    assert "--lan" in help.stdout
+
+
 def test_types_are_seen_from_outside(installed):
     (installed / "use.py").write_text(
         "from invrender.rig import Rig\nreveal_type(Rig().sample_size)\nRig(screen_size='large')\n"
