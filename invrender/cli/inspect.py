@@ -39,6 +39,8 @@ def add_parser(commands: Any) -> None:
 
 def run(args: argparse.Namespace, console: Console) -> int:
     """Run the subcommand."""
+    import numpy as np
+
     from invrender.capture.lights import find_lights
     from invrender.files.capture import Capture, check_photo, load_capture
     from invrender.files.images import read_photo
@@ -74,7 +76,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     if args.out is not None:
         args.out.mkdir(parents=True, exist_ok=True)
         with atomic_path(args.out / "inspect.png") as path:
-            annotate(capture.photo, lights.rig, ball).save(path, format="PNG")
+            annotate(found).save(path, format="PNG", compress_level=1)
         write_exr(args.out / "environment.exr", lights.environment)
         write_exr(args.out / "coverage.exr", lights.coverage)
         write_exr(args.out / "pattern_captured.exr", lights.pattern_captured)
@@ -84,18 +86,42 @@ def run(args: argparse.Namespace, console: Console) -> int:
     x, y = ball.centre
     gain = ", ".join(f"{g:.3g}" for g in lights.gain)
     fit = lights.fit
-    for line in (
+    by = {"rig": "as the rig says", "exif": "by EXIF", "sheet": "by the capture sheet"}
+    known, sheet = numbers["deviations"], found.sheet
+
+    def within(name: str, unit: str = "°", scale: float = 1.0) -> str:
+        value = known[name]
+        return "" if not value else f" ± {scale * value:.2g}{unit}"
+
+    gained = "paper_gain" if fit.get("gain_by_paper") else "gain"
+    camera = camera_place(nominal, capture.rig)
+    if sheet is not None:
+        camera += f", by {len(sheet.ids)} of the sheet's markers{within('camera_tilt')}"
+    elif capture.rig.camera_shift != nominal.camera_shift:
+        camera += ", by the sample's square"
+    lines = [
         f"photo   {capture.photo.width} × {capture.photo.height} pixels, field of view "
-        f"{capture.rig.fov:.1f}°",
-        f"camera  {camera_place(nominal, capture.rig)}",
-        f"ball    at {x:.1f}, {y:.1f}, radius {ball.radius:.1f} pixels, "
-        + ("given by hand" if args.ball else f"confidence {ball.confidence:.2f}"),
-        f"screen  radiance of white {gain}; pattern fits to {fit['residual']:.1%}, display's gamma "
-        f"{fit['gamma']:.2f}, {fit['saturated']:.0%} saturated",
+        f"{numbers['fov']:.1f}{within('fov') or '°'} {by.get(capture.fov_from, 'by the ball')}",
+        f"camera  {camera}",
+        f"ball    {lights.rig.ball_shape} at {x:.1f}, {y:.1f}, radius {ball.radius:.1f} pixels, "
+        + ("given by hand" if args.ball else f"confidence {ball.confidence:.2f}")
+        + f"; reflects {np.mean(lights.rig.ball_reflectance):.0%}"
+        + within("ball_reflectance", " % of that", 100),
+        f"screen  radiance of white {gain}{within(gained, '%', 100)}; pattern fits to "
+        f"{fit['residual']:.1%}, display's gamma {fit['gamma']:.2f}, {fit['saturated']:.0%} "
+        f"saturated",
         f"room    {numbers['coverage']:.0%} of the sky seen, {numbers['room_saturated']:.1%} of it "
         f"saturated; the pattern gives {numbers['pattern_share']:.0%} of the light on the sample",
-    ):
+    ]
+    if "paper_gain" in fit:
+        lines.append(
+            f"paper   {fit['paper_gain']:.2f} times the light that the ball explains"
+            + within("paper_gain", "%", 100)
+        )
+    for line in lines:
         console.print(line)
     for warning in numbers["warnings"]:
         console.print(f"warning: {warning['text']}")
+    for said in numbers["advice"]:
+        console.print(f"next time: {said['text']}")
     return 0

@@ -40,6 +40,9 @@ def test_inspect_tells_the_truth_and_draws_it(folder, tmp_path, capsys):
     assert found["ball_confidence"] > 0.7 and not found["warnings"]
     np.testing.assert_allclose(found["gain"], [2.0, 1.5, 1.0], rtol=0.03)
     assert 0.5 < found["coverage"] < 0.95
+    advice = [said["code"] for said in found["advice"]]
+    assert advice == ["go-closer", "larger-ball", "darken-room", "use-sheet"]
+    assert found["sheet"] is None and 0 < found["deviations"]["fov"] < 1
     with Image.open(tmp_path / "out" / "inspect.png") as picture:
         assert picture.size == (SIZE[1], SIZE[0])
     names = {p.name for p in (tmp_path / "out").iterdir()}
