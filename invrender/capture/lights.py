@@ -262,7 +262,7 @@ def light_warnings(lights: Lights) -> tuple[Notice, ...]:
     if fit.get("saturated", 0) > SCREEN_FIT.saturated and not fit.get("gain_by_paper"):
         text = (
             f"{fit['saturated']:.0%} of the screen is saturated in the ball; its radiance is "
-            "guessed from the rest, and likely too low: expose shorter"
+            f"read from the rest, to ± {fit.get('gain_deviation', 0):.0%}: expose shorter"
         )
         notices.append(Notice("screen-saturated", text))
     if fit.get("room_saturated", 0) > PATTERN_CHECK.room_saturated:

@@ -171,6 +171,9 @@ class _Fit:
         self.observed = pool.mean((1, 3), dtype=float) / reflectance
         self.level = np.full(3, photo.clip_level or np.inf) / reflectance
         self.saturated = pool.max((1, 3)) / reflectance >= self.level
+        # What a file's white cuts off is cut off before colours are blurred.
+        top = self.observed.max((0, 1))
+        self.white = np.where(top >= self.level, top, math.inf)
         if self.coded:  # half the resolution of colours leaves errors: they are compared pooled
             encoded = np.maximum(self.observed, 0) ** (1 / JPEG_GAMMA)
             luma = (encoded @ np.array(JPEG_LUMA))[..., None]
@@ -456,7 +459,9 @@ class _Fit:
             if slopes is not None:
                 slopes = slopes * (steep * curved / np.maximum(model, TINY))
             model = curved
-        model = np.maximum(model, SCREEN_FIT.least_radiance[0])
+        if slopes is not None:
+            slopes = np.where(model < self.white, slopes, 0)
+        model = np.clip(model, SCREEN_FIT.least_radiance[0], self.white)
         mixed = self.blur_colours(u, model ** (1 / JPEG_GAMMA))
         mixed = np.maximum(mixed, SCREEN_FIT.least_radiance[1])
         if slopes is None:
@@ -556,7 +561,7 @@ class _Fit:
         """The fit from ``u`` on with a further block of unknowns."""
         self.free[block] = True
         if block == _CURVE:  # a display's gamma and a camera's power look alike
-            self.set_gamma_prior(DISPLAY.gamma_deviation)
+            self.set_gamma_prior(DISPLAY.gamma_deviation / SCREEN_FIT.correlated)
         for stage in SCREEN_FIT.stages[-2:]:
             u = self.solve(u, *stage)
         place = np.arange(_COUNT)
@@ -622,10 +627,14 @@ class _Fit:
         return out
 
     def gain_deviation(self, u: Array, covariance: Array) -> float:
-        """Standard deviation of the logarithm of the screen's light, the channels' mean."""
+        """Standard deviation of the logarithm of the screen's light over the sample's, the
+        channels' mean."""
         shown = self.pattern ** np.exp(u[_GAMMA])
         by = np.zeros(_COUNT)
         by[_GAIN] = 1 / 3
         log = np.log(self.pattern) * np.exp(u[_GAMMA])
         by[_GAMMA] = (shown * log).mean((0, 1)) / shown.mean((0, 1)) / 3
+        # Of the light over the sample's, which is so much darker than white.
+        sample = DISPLAY.sample * np.exp(u[_GAIN]).mean(keepdims=True) * self.reflectance.mean()
+        by[_CURVE] = curve_shares(sample)[0]
         return float(np.sqrt(by @ covariance @ by)) * SCREEN_FIT.correlated

@@ -392,7 +392,7 @@ class ScreenFit:
     last_cell: float = 1.001  # cells from the pattern's border in a look-up; by hand
     longest_step: float = 0.5  # of the unknowns; by hand
     steps: int = 60  # at most; by hand
-    correlated: float = 3.0  # by which neighbours' like errors raise the gain's deviation; by hand
+    correlated: float = 3.0  # by which neighbours' like errors raise a deviation; by hand
 
 
 @dataclass(frozen=True)
@@ -403,9 +403,9 @@ class Display:
     falloff_deviation: float = 1.0  # of the exponent; measured displays have 0.3 to 1.6
     black_deviation: float = 0.01  # relative to white; by hand
     mixing_deviation: float = 0.05  # of a channel's light in another; measured: 0.01 to 0.09
-    # Of the logarithm of the display's gamma, where the file's tone curve is fitted beside it;
-    # measured displays have gammas of 0.92 to 1.12.
-    gamma_deviation: float = 0.05
+    # Of the logarithm of the display's gamma; measured displays have gammas of 0.92 to 1.12.
+    gamma_deviation: float = 0.06
+    sample: float = 0.1  # of white, the radiance of a sample, about; by hand
     least_gain: float = 0.04  # of the cost, that further unknowns must explain; by hand
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from invrender.files.bracket import merge_bracket
 from invrender.files.images import PHOTOS, Photo, read_image, read_photo
 from invrender.files.maps import read_maps
 from invrender.files.rig_toml import read_rig
@@ -47,6 +49,8 @@ class Capture:
 def load_capture(folder: str | Path) -> Capture:
     """Read a capture folder: ``photo.*``, ``rig.toml``, the pattern, and the truth if there is any.
 
+    ``photo_1.*``, ``photo_2.*`` are exposures of one set-up, and are merged.
+
     Raises `InputError`, one sentence, for anything missing, damaged or out of range.
 
         capture = load_capture("my-capture")
@@ -55,15 +59,11 @@ def load_capture(folder: str | Path) -> Capture:
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder")
-    names = {"photo" + suffix for suffix in PHOTOS}
-    photos = sorted(p for p in folder.iterdir() if p.name.lower() in names and p.is_file())
-    if not photos:
-        raise InputError(f"{folder} has no photo (photo with one of {', '.join(PHOTOS)})")
-    if len(photos) > 1:
-        found = ", ".join(p.name for p in photos)
-        raise InputError(f"{folder} has more than one photo ({found}); leave one")
-    photo = read_photo(photos[0])
-    check_photo(photo, str(photos[0]))
+    paths = find_photos(folder)
+    photos = [read_photo(path) for path in paths]
+    for photo, path in zip(photos, paths, strict=True):
+        check_photo(photo, str(path))
+    photo = photos[0] if len(photos) == 1 else merge_bracket(photos, [p.name for p in paths])
     given = read_rig(folder / "rig.toml", fov=photo.fov)
     pattern_path = _inside(folder, given.files.get("pattern") or _find_pattern(folder))
     pattern = read_image(pattern_path)
@@ -81,6 +81,28 @@ def load_capture(folder: str | Path) -> Capture:
         photo, given.rig, np.clip(pattern, 0, 1), truth, environment, given.fov_from,
         (*photo.warnings, *given.warnings), folder.resolve().name, given.unknown,
     )  # fmt: skip
+
+
+def find_photos(folder: Path) -> list[Path]:
+    """The photo of a capture's folder, ``photo.*``, or its exposures, ``photo_1.*`` and so on.
+
+    All exposures are of one pattern: a bracket (`invrender.files.bracket`).
+    """
+    files = sorted(p for p in folder.iterdir() if p.suffix.lower() in PHOTOS and p.is_file())
+    whole = [p for p in files if p.stem.lower() == "photo"]
+    parts = [p for p in files if re.fullmatch(r"photo[_-]?\d+", p.stem.lower())]
+    found = whole + parts
+    if not found:
+        raise InputError(f"{folder} has no photo (photo with one of {', '.join(PHOTOS)})")
+    if whole and len(found) > 1:
+        names = ", ".join(p.name for p in found)
+        raise InputError(
+            f"{folder} has more than one photo ({names}); leave one, or name the exposures of one "
+            "set-up photo_1, photo_2 and so on"
+        )
+    if len({p.stem.lower() for p in parts}) < len(parts):
+        raise InputError(f"{folder} has one exposure as two files; leave one of each")
+    return found
 
 
 def check_photo(photo: Photo, name: str = "the photo") -> None:
