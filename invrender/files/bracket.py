@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -128,15 +129,19 @@ def _aligned(image: Array, reference: Array, name: str, first: str) -> Array:
     h, w = image.shape[:2]
     scale = min(1.0, SETTINGS.aligned_pixels / max(h, w))
     size = round(w * scale), round(h * scale)
-    small = [cv2.resize(a, size, interpolation=cv2.INTER_AREA) for a in (reference, image)]
+    small: list[Array] = [
+        np.asarray(cv2.resize(a, size, interpolation=cv2.INTER_AREA), np.float32)
+        for a in (reference, image)
+    ]
     mask = (np.minimum(*(a.max(-1) for a in small)) > SETTINGS.usable[0]).astype(np.uint8)
     # What is saturated in the longer exposure has no detail there.
     mask &= (small[1].min(-1) < SETTINGS.usable[1]).astype(np.uint8)
-    warp = np.eye(3, dtype=np.float32)
+    start = np.eye(3, dtype=np.float32)
+    moved: Any = start
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, *SETTINGS.steps)
     try:
-        found, warp = cv2.findTransformECC(
-            _ranks(small[0]), _ranks(small[1]), warp, cv2.MOTION_HOMOGRAPHY, criteria, mask,
+        found, moved = cv2.findTransformECC(
+            _ranks(small[0]), _ranks(small[1]), start, cv2.MOTION_HOMOGRAPHY, criteria, mask,
             SETTINGS.smoothing,
         )  # fmt: skip
     except cv2.error:
@@ -149,7 +154,7 @@ def _aligned(image: Array, reference: Array, name: str, first: str) -> Array:
     # From the centres of the small image's pixels to those of the photo's, both at whole numbers.
     x, y = size[0] / w, size[1] / h
     zoom = np.array([[x, 0, x / 2 - 0.5], [0, y, y / 2 - 0.5], [0, 0, 1]])
-    full = np.linalg.inv(zoom) @ warp @ zoom
+    full = np.linalg.inv(zoom) @ np.asarray(moved) @ zoom
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     outside = (np.nan,) * 3
     return np.asarray(
