@@ -19,6 +19,7 @@ from invrender.files.capture import load_capture
 from invrender.files.output import check_output
 from invrender.lights import Lights
 from invrender.maps import Estimate, Maps, map_errors, resize_maps, turn_maps
+from invrender.pattern.default import default_pattern
 from invrender.report.notices import map_notices
 from invrender.report.report import Report
 from invrender.report.result import SAMPLES, Result
@@ -28,6 +29,8 @@ if TYPE_CHECKING:  # Dr.Jit compiles where the refinement is imported
     from invrender.refine.gauss_newton import Observation, Refined
 
 MEGABYTES = 200e-6, 8  # of a result: a pixel, and for the rest
+ASKED = 2  # photos of several whose maps networks estimate
+MEASURED = 3  # photos from which these count for more than what networks know
 
 
 class Stages:
@@ -215,48 +218,63 @@ def estimate_maps(
         from invrender.refine.lobes import fit_lobes
         from invrender.refine.posterior import explain
         from invrender.refine.priors import lobe_prior, network_prior, pooled
-        from invrender.refine.several import find_turn
+        from invrender.refine.several import by_pattern, explain_together, find_turn, likeliest
         from invrender.refine.shared import share
         from invrender.refine.theta import to_maps
 
         photos = [c.observation() for c in crops]
-    if init == "flat":
+    several, measured = len(crops) > 1, len(crops) >= MEASURED
+    if several or init == "flat":
         with stage("initial maps"):
-            starts = [flat_maps(p.photo, p.renderer, samples) for p in photos]
+            flat = [flat_maps(p.photo, p.renderer, samples) for p in photos]
+    turns = [0] + [find_turn(m, flat[0]) for m in flat[1:]] if several else [0]
+    interrupted = False
+    if init == "flat":
+        start = flat[0]
         with stage("materials"):
-            own = [fit_lobes(p.photo, p.renderer, samples) for p in photos]
-        turns = [0] + [find_turn(m, starts[0]) for m in starts[1:]]
-        prior = lobe_prior(own[0])
+            prior = lobe_prior(fit_lobes(photos[0].photo, photos[0].renderer, samples))
     else:
         reconstruct, improve = networks
+        # What networks know of a sample they tell from the photos whose pattern they know best.
+        asked = by_pattern([c.lights.pattern for c in crops], default_pattern())[:ASKED]
         with stage("initial maps"):
             told = stage.part("initial maps")
-            estimates = [reconstruct(c.photo, c.lights, told, keep) for c in crops]
-        starts = [e.maps for e in estimates]
+            estimates = [reconstruct(crops[i].photo, crops[i].lights, told, keep) for i in asked]
+        start = turn_maps(estimates[0].maps, -turns[asked[0]])
         with stage("refine"):
-            for i, p in enumerate(photos):
-                told = stage.part("refine")
-                estimates[i] = improve(p.photo, p.renderer, estimates[i], p.clipped, samples, told)
-                if estimates[i].interrupted:
+            told = stage.part("refine")
+            for k, i in enumerate(asked):
+                p = photos[i]
+                estimates[k] = improve(p.photo, p.renderer, estimates[k], p.clipped, samples, told)
+                interrupted = estimates[k].interrupted
+                if interrupted:
                     break
-        turns = [0] + [find_turn(m, starts[0]) for m in starts[1:]]
-        prior = pooled([
-            network_prior(turn_maps(e.maps, -k), {n: np.rot90(x, -k) for n, x in e.sigma.items()})
-            for e, k in zip(estimates, turns, strict=True)
-        ])  # fmt: skip
+        priors = [
+            network_prior(
+                turn_maps(e.maps, -turns[i]),
+                {n: np.rot90(x, -turns[i]) for n, x in e.sigma.items()},
+            )
+            for e, i in zip(estimates, asked, strict=True)
+        ]
+        prior = pooled(priors)
     with stage("forward model"):
         photos = [
             photo if k == 0 else c.observation(-k)
             for photo, c, k in zip(photos, crops, turns, strict=True)
         ]
     with stage("refine"):
-        if init == "flat":
+        if interrupted:
+            result = Refined(to_maps(prior.mean), prior.expected, interrupted=True)
+        elif measured:
+            if init != "flat":
+                prior = likeliest(photos, [*priors, pooled(priors)], samples)
+            told = stage.part("refine")
+            result = explain_together(photos, prior, samples=samples, progress=told)
+        elif init == "flat":
             result = refine(
                 photos, prior, samples=samples,
                 progress=lambda i, e: stage.progress(f"refine: step {i}, photo error {e:.4f}"),
             )  # fmt: skip
-        elif any(e.interrupted for e in estimates):
-            result = Refined(to_maps(prior.mean), prior.expected, interrupted=True)
         else:
             known = share(photos, prior, samples=samples)
             photos = known.observations
@@ -266,7 +284,7 @@ def estimate_maps(
                 result = explain(photos, known.prior, samples=samples)
                 result.converged &= known.converged
             result.factors = known.factors
-    return starts[0], result, photos
+    return start, result, photos
 
 
 def _capture_fit(found: FoundLights) -> dict[str, Any]:

@@ -1,0 +1,140 @@
+"""Several photos of one sample, explained together."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from invrender.data.environments import procedural_environment
+from invrender.data.materials import procedural_material
+from invrender.lights import Lights
+from invrender.maps import constant_maps, map_errors
+from invrender.pattern.default import default_pattern
+from invrender.refine.gauss_newton import Observation
+from invrender.refine.priors import network_prior
+from invrender.refine.several import by_pattern, explain_together, likeliest
+from invrender.refine.shared_roughness import ROUGHNESS, pool_roughness
+from invrender.refine.theta import R, to_maps, to_theta
+from invrender.render.fast.estimator import Fast
+from invrender.rig import Rig
+from invrender.sphere import scale_environment
+
+SIZE = 24
+NAMES = ("diffuse", "specular", "roughness", "normal")
+
+
+def half(axis, side):
+    pattern = np.full((16, 16, 3), 0.02, np.float32)
+    np.moveaxis(pattern, axis, 0)[8 * side : 8 * side + 8] = 1
+    return pattern
+
+
+PATTERNS = [default_pattern(), *(half(axis, side) for axis in (0, 1) for side in (0, 1))]
+
+
+@pytest.fixture(scope="module")
+def renderers():
+    room = scale_environment(procedural_environment(3, 64), 0.3)
+    return [Fast.under(Lights(Rig(), p, room, 2.0)) for p in PATTERNS]
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return procedural_material(5, SIZE, SIZE, kind="leather")
+
+
+def photos_of(maps, renderers):
+    rng = np.random.default_rng(0)
+    photos = [r.render(maps, 64) for r in renderers]
+    photos = [p * (1 + 0.005 * rng.standard_normal(p.shape).astype(np.float32)) for p in photos]
+    return [Observation(p, r) for p, r in zip(photos, renderers, strict=True)]
+
+
+def as_a_network_errs(truth):
+    """Flat, too rough, and 20% too bright."""
+    theta = to_theta(truth)
+    theta[..., 7:] *= 0.2
+    theta[..., R] = np.clip(theta[..., R] + 0.1, 0, 1)
+    theta[..., :3] *= 1.2
+    return network_prior(to_maps(theta), {k: np.full(truth.shape, 0.05, np.float32) for k in NAMES})
+
+
+def explained(photos, prior):
+    return explain_together(photos, prior, samples=16)
+
+
+@pytest.fixture(scope="module")
+def found(truth, renderers):
+    return explained(photos_of(truth, renderers), as_a_network_errs(truth))
+
+
+def test_five_photos_measure_what_one_leaves_to_the_prior(truth, found):
+    before = map_errors(to_maps(as_a_network_errs(truth).mean), truth)
+    after = map_errors(found.maps, truth)
+    assert after["normal"] < 0.7 * before["normal"]
+    assert after["diffuse"] < 0.5 * before["diffuse"]
+    assert after["roughness"] < 0.75 * before["roughness"]
+    assert after["specular"] < 0.01  # a dielectric stays one
+    assert max(found.photo_errors) < 0.04 and not found.left_out
+
+
+def test_a_photo_s_own_exposure_and_another_sample_are_found(truth, renderers, found):
+    photos = photos_of(truth, renderers)
+    photos[2] = replace(photos[2], photo=photos[2].photo * np.float32([1.08, 1, 0.95]))
+    other = procedural_material(2, SIZE, SIZE, kind="bricks")
+    photos.append(photos_of(other, renderers)[3])
+    drifted = explained(photos, as_a_network_errs(truth))
+    assert drifted.left_out == [5]
+    before, after = (map_errors(f.maps, truth) for f in (found, drifted))
+    assert after["normal"] < 1.4 * before["normal"]
+    assert after["average"] < 1.3 * before["average"] + 0.003
+
+
+@pytest.mark.parametrize("value", [0.0, 1e6])
+def test_any_photos_give_finite_maps_in_range(renderers, value):
+    maps = constant_maps(4, 4)
+    prior = network_prior(maps, {k: np.full((4, 4), 0.05, np.float32) for k in NAMES})
+    photos = [Observation(np.full((4, 4, 3), value, np.float32), r) for r in renderers[:3]]
+    found = explained(photos, prior)
+    for name, image in found.maps.encoded().items():
+        assert np.isfinite(image).all() and image.min() >= 0 and image.max() <= 1, name
+    assert np.isfinite(found.sigma).all()
+
+
+def test_bands_and_saturated_pixels(truth, renderers, found, monkeypatch):
+    """Rows are solved in bands; a pixel that no photo measures stays where the prior is."""
+    prior, photos = as_a_network_errs(truth), photos_of(truth, renderers)
+    clipped = np.zeros(truth.shape, bool)
+    clipped[4, 5] = True
+    monkeypatch.setattr("invrender.refine.several.BAND", SIZE * 8)
+    parts = explained([replace(p, clipped=clipped) for p in photos], prior)
+    assert map_errors(parts.maps, found.maps)["average"] < 0.02
+    np.testing.assert_allclose(to_theta(parts.maps)[4, 5, :6], prior.mean[4, 5, :6], atol=1e-3)
+    assert parts.sigma[4, 5, 0] > 5 * np.median(parts.sigma[..., 0])
+
+
+def test_roughness_is_that_of_the_materials_pixels_or_the_prior_s():
+    theta = to_theta(constant_maps(16, 16, 0.3, 0.04, 0.5))
+    theta[:8, :, :3] = 0.8
+    sigma = np.full((16, 16), 0.1, np.float32)
+    wanted = np.where(np.arange(16) < 8, 0.33, 0.8)[:, None]
+
+    def told(rho, start):
+        return start, np.broadcast_to(((rho - wanted) / 0.1) ** 2, (16, 16))
+
+    mean, spread = pool_roughness(theta, sigma, told).roughness(theta)
+    np.testing.assert_allclose(mean, np.broadcast_to(wanted, (16, 16)), atol=0.09)
+    assert spread.max() < 0.15
+    silent = pool_roughness(theta, sigma, lambda rho, start: (start, np.zeros((16, 16))))
+    assert np.abs(silent.roughness(theta)[0] - 0.5).max() < np.diff(ROUGHNESS).max() / 2
+
+
+def test_the_likelier_prior_is_taken(truth, renderers):
+    right = network_prior(truth, {k: np.full(truth.shape, 0.05, np.float32) for k in NAMES})
+    wrong = as_a_network_errs(truth)
+    assert likeliest(photos_of(truth, renderers), [wrong, right], 32) is right
+
+
+def test_photos_under_the_known_pattern_come_first():
+    known = default_pattern()
+    assert by_pattern([half(0, 0), known, half(1, 0), known[::2, ::2]], known)[:2] == [1, 3]
