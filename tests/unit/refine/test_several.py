@@ -60,7 +60,7 @@ def as_a_network_errs(truth):
 
 
 def explained(photos, prior):
-    return explain_together(photos, prior, samples=16)
+    return explain_together(photos, prior)
 
 
 @pytest.fixture(scope="module")
