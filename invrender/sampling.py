@@ -42,10 +42,12 @@ def _weights(old: int, new: int) -> csr_array:
     return csr_array((values, column.ravel(), start), shape=(new, old))
 
 
-def resize_pattern(pattern: NDArray[Any], size: int) -> NDArray[np.float32]:
-    """A pattern (h, w, 3) at (size, size, 3): bilinear to more pixels, means over the new pixels'
-    areas to fewer."""
-    rows, columns = (_resampling(n, size) for n in pattern.shape[:2])
+def resize_pattern(
+    pattern: NDArray[Any], size: int, width: int | None = None
+) -> NDArray[np.float32]:
+    """A pattern (h, w, 3) at (size, width or size, 3): bilinear to more pixels, means over the new
+    pixels' areas to fewer."""
+    rows, columns = map(_resampling, pattern.shape[:2], (size, width or size))
     out = np.einsum("ir,jc,rcd->ijd", rows, columns, pattern, optimize=True)
     return np.clip(out, 0, 1).astype(np.float32)
 

@@ -7,7 +7,7 @@ import re
 import secrets
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from invrender.files.write import atomic_path
 from invrender.rig import BALL_SHAPES, Rig
@@ -16,37 +16,6 @@ from invrender.types import InputError
 LONGEST_NAME = 80  # characters
 MOST_PROFILES = 100
 PHOTO_COUNTS = (1, 5)  # the default pattern alone, or with the four halves
-
-
-class Tablet(NamedTuple):
-    """A display: its long and short side in pixels, and pixels an inch, as its maker states."""
-
-    name: str
-    long: int
-    short: int
-    ppi: float
-
-
-# By the makers' data sheets.
-TABLETS = (
-    Tablet("iPad Pro 13″ (M4)", 2752, 2064, 264),
-    Tablet("iPad Pro 12.9″, iPad Air 13″", 2732, 2048, 264),
-    Tablet("iPad Pro 11″ (M4)", 2420, 1668, 264),
-    Tablet("iPad Pro 11″ (2018–2022)", 2388, 1668, 264),
-    Tablet("iPad Air 11″, iPad 10.9″", 2360, 1640, 264),
-    Tablet("iPad 10.2″", 2160, 1620, 264),
-    Tablet("iPad mini 8.3″", 2266, 1488, 326),
-    Tablet("Galaxy Tab S8, S9 11″", 2560, 1600, 274),
-    Tablet("Galaxy Tab S8+, S9+ 12.4″", 2800, 1752, 266),
-    Tablet("Galaxy Tab S8, S9 Ultra 14.6″", 2960, 1848, 239),
-    Tablet("Galaxy Tab A9+ 11″", 1920, 1200, 206),
-    Tablet("Pixel Tablet 11″", 2560, 1600, 276),
-    Tablet("Xiaomi Pad 6 11″", 2880, 1800, 309),
-    Tablet("OnePlus Pad 11.6″", 2800, 2000, 296),
-    Tablet("Surface Pro 8, 9 13″", 2880, 1920, 267),
-    Tablet("Surface Go 10.5″", 1920, 1280, 220),
-    Tablet("Fire HD 10 10.1″", 1920, 1200, 224),
-)
 
 
 @dataclass(frozen=True)

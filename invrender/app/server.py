@@ -32,6 +32,7 @@ from invrender.app.guard import Bucket, Guard, too_many
 from invrender.app.profiles import Profile
 from invrender.app.workers import Died, Worker
 from invrender.pattern.display import pattern_page
+from invrender.pattern.tablets import TABLETS
 from invrender.report.report import Report
 from invrender.types import InputError
 
@@ -125,7 +126,7 @@ class App:
         return {
             "version": version("invrender"), "captures": captures, "links": self.links,
             "profiles": [asdict(p) for p in self.profiles()], "sizes": SIZES,
-            "tablets": [t._asdict() for t in profiles.TABLETS], "shown": self.shown,
+            "tablets": [t._asdict() for t in TABLETS], "shown": self.shown,
             "patterns": patterns.PATTERNS, "folder": str(self.root),
         }  # fmt: skip
 

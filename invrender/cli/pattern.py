@@ -18,16 +18,26 @@ def add_parser(commands: Any) -> None:
         description="Write the light pattern: as an image for the capture's folder (PNG, EXR); as "
         "a page that a tablet's browser shows at its real size (HTML); as a PNG for a display of "
         "known --ppi. The sample looks at the display from below, so that devices must show it "
-        "mirrored; the last two are. A PDF is the guide: the rig drawn to scale, and a template.",
+        "mirrored; the last two are. A PDF is the guide: the rig drawn to scale, and the capture "
+        "sheet.",
     )
     parser.add_argument(
-        "-o", "--out", type=Path, required=True, help="PNG (sRGB), EXR (linear), HTML or PDF"
+        "-o",
+        "--out",
+        type=Path,
+        required=True,
+        help="PNG (sRGB), EXR, HTML, PDF; TOML with --device",
     )
     parser.add_argument("--size", type=int, help="pixels a side of an image (1024)")
     parser.add_argument(
         "--ppi",
         type=float,
         help="pixels an inch of the device: the image, or the page, has the rig's size on it",
+    )
+    parser.add_argument(
+        "--device",
+        help="a common tablet by name, e.g. 'iPad Pro 11', for its display's size and --ppi; -o "
+        "FILE.toml writes its rig.toml",
     )
     parser.add_argument("--mirrored", action="store_true", help="as the device must show it")
     parser.add_argument(
@@ -45,22 +55,28 @@ def run(args: argparse.Namespace, console: Console) -> int:
     from rich.progress import Progress
 
     from invrender.files.output import check_output
-    from invrender.files.rig_toml import read_rig
+    from invrender.files.rig_toml import FOUND_IN_PHOTO, read_rig, write_rig
     from invrender.files.write import atomic_path, write_exr, write_png
     from invrender.pattern.default import default_pattern, mirrored
     from invrender.pattern.display import pattern_page, write_display_png
     from invrender.pattern.guide import write_guide
+    from invrender.pattern.tablets import find_tablet, tablet_rig
     from invrender.rig import Rig
     from invrender.sampling import resize_pattern
     from invrender.types import InputError
 
     suffix = args.out.suffix.lower()
-    if suffix not in (".png", ".exr", ".html", ".pdf"):
+    tablet, others = find_tablet(args.device) if args.device is not None else (None, [])
+    if suffix == ".toml" and tablet is None:
+        raise InputError("a rig.toml is written for a --device")
+    if tablet and (args.rig or args.ppi is not None):
+        raise InputError("--device gives what --rig and --ppi would: leave these out")
+    if suffix not in (".png", ".exr", ".html", ".pdf", ".toml"):
         raise InputError(f"{args.out}: the pattern is a .png, .exr or .html, the guide a .pdf")
     size = 1024 if args.size is None else args.size
     if not 1 <= size <= 8192:
         raise InputError("the pattern's size must be between 1 and 8192")
-    real = suffix == ".html" or args.ppi is not None
+    real = suffix == ".html" or args.ppi is not None or (tablet is not None and suffix == ".png")
     if args.ppi is not None and suffix not in (".png", ".html"):
         raise InputError("--ppi is for .png and .html")
     if args.size is not None and (real or suffix == ".pdf"):
@@ -76,6 +92,16 @@ def run(args: argparse.Namespace, console: Console) -> int:
             "all rigs"
         )
     rig = read_rig(args.rig).rig if args.rig else Rig()
+    ppi = args.ppi
+    if tablet:
+        rig, ppi = tablet_rig(tablet), tablet.ppi
+        console.print(f"taken as {tablet.name}, {tablet.long} × {tablet.short} pixels")
+        if others:
+            console.print(f"not as {', '.join(t.name for t in others)}")
+    if suffix == ".toml":
+        write_rig(args.out, rig, "pattern.png", leave=FOUND_IN_PHOTO | {"fov"})
+        console.print(f"wrote {args.out}")
+        return 0
     if suffix == ".pdf":
         if args.optimise or args.mirrored:
             raise InputError("the guide has no pattern: leave out --optimise and --mirrored")
@@ -105,11 +131,11 @@ def run(args: argparse.Namespace, console: Console) -> int:
     else:
         pattern = default_pattern()
     if suffix == ".html":
-        page = pattern_page(pattern, max(rig.screen_sides), args.ppi)
+        page = pattern_page(pattern, rig.screen_sides, ppi)
         with atomic_path(args.out) as path:
             path.write_text(page, encoding="utf-8")
     elif real:
-        write_display_png(args.out, pattern, max(rig.screen_sides), args.ppi)
+        write_display_png(args.out, pattern, rig.screen_sides, ppi)
     else:
         image = resize_pattern(pattern, size)
         image = mirrored(image) if args.mirrored else image

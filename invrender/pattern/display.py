@@ -15,6 +15,7 @@ from PIL import Image
 from invrender.colour import linear_to_srgb
 from invrender.files.write import INCH, atomic_path
 from invrender.pattern.default import mirrored
+from invrender.pattern.tablets import TABLETS
 from invrender.sampling import resize_pattern
 from invrender.types import Array, InputError
 
@@ -35,26 +36,32 @@ def device_pixels(size: float, ppi: float) -> int:
     return pixels
 
 
-def write_display_png(path: Path, pattern: Array, size: float, ppi: float) -> None:
-    """Write the pattern (h, w, 3) as a device must show it, mirrored, ``size`` metres a side.
+Size = float | tuple[float, float]  # metres: of a square's side, or along x and y
+
+
+def write_display_png(path: Path, pattern: Array, size: Size, ppi: float) -> None:
+    """Write the pattern (h, w, 3) as a device must show it, mirrored, ``size`` metres large.
 
     The file states its resolution (pHYs). Raises `InputError` for impossible sizes.
     """
-    image = encoded(pattern, device_pixels(size, ppi))
+    wide, deep = _sides(size)
+    image = encoded(pattern, device_pixels(deep, ppi), device_pixels(wide, ppi))
     with atomic_path(path) as temporary:
         image.save(temporary, format="PNG", dpi=(ppi, ppi))
 
 
-def pattern_page(pattern: Array, size: float, ppi: float | None = None, script: str = "") -> str:
-    """An HTML page that shows the pattern (h, w, 3), mirrored, ``size`` metres a side.
+def pattern_page(pattern: Array, size: Size, ppi: float | None = None, script: str = "") -> str:
+    """An HTML page that shows the pattern (h, w, 3), mirrored, ``size`` metres large.
 
     It is one file and loads nothing: its content security policy allows the image inside it and
     its one script, by that script's hash. Without ``ppi``, the display's pixels an inch, its user
-    finds the scale with a bank card. ``script``: the address of one more script, for a page that a
-    server of its own keeps in step: it may ask that server, and nobody else.
+    names the tablet or finds the scale with a bank card. ``script``: the address of one more
+    script, for a page that a server of its own keeps in step: it may ask that server, and nobody
+    else.
     """
+    wide, deep = _sides(size)
     if ppi is not None:
-        device_pixels(size, ppi)
+        device_pixels(wide, ppi), device_pixels(deep, ppi)
     out = io.BytesIO()
     encoded(pattern, PAGE_PIXELS).save(out, "PNG")
     own = _data("page.js")
@@ -68,13 +75,19 @@ def pattern_page(pattern: Array, size: float, ppi: float | None = None, script: 
         more=script,
         script_hash=f"sha256-{digest}",
         uri="data:image/png;base64," + base64.b64encode(out.getvalue()).decode(),
-        mm=1000 * size,
+        mm=1000 * wide,
+        deep=1000 * deep,
         ppi=ppi,
+        tablets=TABLETS,
     )
 
 
-def encoded(pattern: Array, pixels: int) -> Image.Image:
-    data = linear_to_srgb(mirrored(resize_pattern(pattern, pixels)))
+def _sides(size: Size) -> tuple[float, float]:
+    return size if isinstance(size, tuple) else (size, size)
+
+
+def encoded(pattern: Array, rows: int, columns: int | None = None) -> Image.Image:
+    data = linear_to_srgb(mirrored(resize_pattern(pattern, rows, columns)))
     return Image.fromarray((data * 255 + 0.5).astype(np.uint8))
 
 

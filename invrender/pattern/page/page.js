@@ -15,21 +15,39 @@ function remember(key, value) {
 const given = parseFloat(body.dataset.ppi) || null;
 const state = {
   ppi: given || remembered("ppi") || 96 * devicePixelRatio,
-  side: parseFloat(body.dataset.mm),
+  side: parseFloat(body.dataset.mm), // its width
+  deep: parseFloat(body.dataset.deep), // its height
   known: Boolean(given || remembered("ppi")),
   awake: null, // the wake lock
+  told: "", // what was said to disturb
 };
 
 const pixels = (mm) => mm / 25.4 * state.ppi; // of the display
 const css = (mm) => Math.round(pixels(mm)) / devicePixelRatio + "px";
-// Full screen, if the browser can: then all of the display.
-const room = () => {
-  const zoom = devicePixelRatio;
+// Full screen, if the browser can: then all of the display. Width and height in CSS pixels.
+const display = () => {
   const full = document.fullscreenEnabled && !document.fullscreenElement;
-  const width = full ? Math.max(screen.width, innerWidth) : innerWidth;
-  const height = full ? Math.max(screen.height, innerHeight) : innerHeight;
-  return Math.min(width, height) * zoom / state.ppi * 25.4; // mm
+  return full ? [Math.max(screen.width, innerWidth), Math.max(screen.height, innerHeight)]
+    : [innerWidth, innerHeight];
 };
+const room = () => display().map((v) => v * devicePixelRatio / state.ppi * 25.4); // mm
+
+// What would make the pattern another one than it is taken for.
+function disturbed() {
+  if (window.visualViewport && Math.abs(visualViewport.scale - 1) > 0.005) {
+    return "The page is zoomed by two fingers: zoom out until it fits.";
+  }
+  if (matchMedia("(inverted-colors: inverted)").matches || matchMedia("(forced-colors: active)").matches) {
+    return "The display changes colours for accessibility: switch that off while you take the picture.";
+  }
+  return "";
+}
+
+// Whether the page is smaller than the display: in a window, or zoomed where that changes no pixels.
+function partial() {
+  const wide = [screen.width, screen.height]; // some browsers do not turn these with the device
+  return innerWidth < 0.98 * Math.max(...wide) && wide.every((w) => Math.abs(innerWidth - w) > 0.02 * w);
+}
 
 function layout() {
   at("card").style.width = css(CARD[0]);
@@ -37,16 +55,25 @@ function layout() {
   for (const id of ["scale", "ppi"]) {
     if (document.activeElement !== at(id)) at(id).value = state.ppi.toFixed(1);
   }
-  if (document.activeElement !== at("side")) at("side").value = state.side;
-  at("metres").textContent = (state.side / 1000).toFixed(4);
+  for (const id of ["side", "deep"]) {
+    if (document.activeElement !== at(id)) at(id).value = state[id];
+  }
+  const metres = [state.side, state.deep].map((v) => (v / 1000).toFixed(4));
+  at("metres").textContent = state.side === state.deep ? metres[0] : `[${metres.join(", ")}]`;
   const image = at("pattern");
-  image.style.width = image.style.height = css(state.side);
+  image.style.width = css(state.side);
+  image.style.height = css(state.deep);
   // Beside the camera, at the left; in the middle of that edge.
-  const free = innerHeight - Math.round(pixels(state.side)) / devicePixelRatio;
+  const free = innerHeight - Math.round(pixels(state.deep)) / devicePixelRatio;
   image.style.top = Math.round(Math.max(free, 0) / 2 * devicePixelRatio) / devicePixelRatio + "px";
-  const largest = room(), fits = state.side > 0 && pixels(state.side) <= pixels(largest) + 1;
-  at("fits").textContent = fits ? "" :
-    `too large: this display shows at most ${Math.floor(largest * 2) / 2} mm`;
+  const [wide, high] = room();
+  const fits = state.side > 0 && pixels(state.side) <= pixels(wide) + 1 &&
+    state.deep > 0 && pixels(state.deep) <= pixels(high) + 1;
+  at("fits").textContent = fits ? "" : "too large: this display, as it is held, shows at most " +
+    `${Math.floor(wide * 2) / 2} × ${Math.floor(high * 2) / 2} mm`;
+  const trouble = disturbed();
+  at("zoomed").textContent = trouble;
+  at("zoomed").hidden = !trouble;
   at("fits").className = fits ? "" : "bad";
   at("show").disabled = !fits;
   at("show").textContent = state.known ? "Show the pattern" : "Real size is right: show the pattern";
@@ -83,6 +110,15 @@ async function show() {
   if (document.documentElement.requestFullscreen) {
     try { await document.documentElement.requestFullscreen({ navigationUI: "hide" }); } catch { /* as it is */ }
   }
+  if (partial()) await new Promise((done) => setTimeout(done, 300)); // until full screen is drawn
+  const trouble = disturbed() || (partial() ? "The page does not fill the display: set the browser's " +
+    "zoom to 100% and use full screen." : "");
+  if (trouble && state.told !== trouble) {
+    state.told = trouble;
+    hide();
+    tell(trouble + " To show the pattern as it is, press again.");
+    return;
+  }
   body.classList.add("shown");
   scrollTo(0, 0);
   layout();
@@ -100,11 +136,18 @@ at("scale").addEventListener("input", (e) => setPpi(parseFloat(e.target.value)))
 at("ppi").addEventListener("input", (e) => setPpi(parseFloat(e.target.value)));
 at("less").addEventListener("click", () => setPpi(state.ppi - 0.2));
 at("more").addEventListener("click", () => setPpi(state.ppi + 0.2));
-at("side").addEventListener("input", (e) => {
-  const value = parseFloat(e.target.value);
-  if (value >= 1 && value <= 5000) { state.side = value; layout(); }
+for (const id of ["side", "deep"]) {
+  at(id).addEventListener("input", (e) => {
+    const value = parseFloat(e.target.value);
+    if (value >= 1 && value <= 5000) { state[id] = value; layout(); }
+  });
+}
+at("fill").addEventListener("click", () => {
+  [state.side, state.deep] = room().map((v) => Math.floor(v * 10) / 10);
+  layout();
 });
-for (const id of ["ppi", "side", "scale"]) at(id).addEventListener("change", layout);
+at("tablet").addEventListener("change", (e) => { if (e.target.value) setPpi(parseFloat(e.target.value)); });
+for (const id of ["ppi", "side", "deep", "scale"]) at(id).addEventListener("change", layout);
 at("show").addEventListener("click", show);
 at("pattern").addEventListener("click", hide);
 body.addEventListener("click", (e) => { if (e.target === body) hide(); });
@@ -117,4 +160,8 @@ document.addEventListener("visibilitychange", () => {
   if (document.visibilityState === "visible" && body.classList.contains("shown")) stayAwake();
 });
 addEventListener("resize", layout);
+if (window.visualViewport) visualViewport.addEventListener("resize", () => {
+  if (body.classList.contains("shown") && Math.abs(visualViewport.scale - 1) > 0.005) hide();
+  layout();
+});
 layout();

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import time
 from dataclasses import replace
 
 import cv2
@@ -18,7 +19,7 @@ from rich.console import Console
 from invrender.cli.pattern import add_parser
 from invrender.data.environments import procedural_environment
 from invrender.files.images import read_image
-from invrender.files.rig_toml import write_rig
+from invrender.files.rig_toml import read_rig, write_rig
 from invrender.files.write import INCH
 from invrender.pattern.default import block_pattern, default_pattern, mirrored
 from invrender.pattern.design import (
@@ -35,6 +36,7 @@ from invrender.pattern.design import (
 from invrender.pattern.design.population import _shade
 from invrender.pattern.display import pattern_page
 from invrender.pattern.guide import _sheet, needed_focal
+from invrender.pattern.tablets import TABLETS, find_tablet
 from invrender.rig import Rig
 from invrender.sampling import resize_pattern
 from invrender.sheet import capture_sheet, marker_dictionary
@@ -258,6 +260,9 @@ def test_png_for_a_device_has_its_size_and_is_mirrored(tmp_path):
         (("x.exr", "--ppi", 100), "for .png and .html"),
         (("x.html", "--size", 100), "--size is for"),
         (("x.pdf", "--mirrored"), "no pattern"),
+        (("x.toml",), "for a --device"),
+        (("x.html", "--device", "Nokia"), "known are: iPad"),
+        (("x.html", "--device", "iPad mini", "--ppi", 300), "leave these out"),
     ],
 )
 def test_impossible_devices_are_refused(words, match, tmp_path, monkeypatch):
@@ -300,6 +305,81 @@ def test_page_is_one_file_of_the_rigs_size(tmp_path):
     assert run("-o", tmp_path / "a.html", "--rig", tmp_path / "rig.toml") == 0
     page = (tmp_path / "a.html").read_text()
     assert 'data-mm="150"' in page and "http" not in page.replace("http-equiv", "")
+
+
+@pytest.mark.parametrize(
+    ("name", "pixels"),
+    [
+        ("iPad Pro 11", (2420, 1668)),
+        ("11-inch iPad Air", (2360, 1640)),
+        ('galaxy tab s9 ultra 14.6"', (2960, 1848)),
+        ("ipad mini", (2266, 1488)),
+    ],
+)
+def test_tablets_are_known_by_name(name, pixels, tmp_path):
+    tablet, _ = find_tablet(name)
+    assert (tablet.long, tablet.short) == pixels
+    assert run("--device", name, "-o", tmp_path / "rig.toml") == 0
+    file = read_rig(tmp_path / "rig.toml")
+    assert file.fov_from == "unknown" and len(file.unknown) == 2
+    assert file.rig.screen_sides == pytest.approx(tablet.sides, abs=1e-4)
+    assert file.rig.sample_size == pytest.approx(tablet.sides[1] / 2, abs=1e-4)
+    assert capture_sheet(file.rig).paper == "A4 or Letter" or "14.6" in tablet.name
+    assert run("--device", name, "-o", tmp_path / "a.png") == 0
+    with Image.open(tmp_path / "a.png") as image:
+        assert image.size == pytest.approx(pixels, abs=1)
+
+
+def test_every_tablet_is_as_large_as_its_name_says():
+    for tablet in TABLETS:
+        inches = re.findall(r"([\d.]+)″", tablet.name)
+        diagonal = np.hypot(*tablet.sides) / INCH
+        # Makers round, and one panel has two names.
+        assert min(abs(diagonal - float(i)) for i in inches) < 0.2, tablet
+        assert tablet.long > tablet.short
+
+
+def test_page_fills_the_display_and_warns_of_what_disturbs_it(tmp_path):
+    if CHROMIUM is None:
+        pytest.skip("no Chromium here (apt-get install chromium)")
+    path = tmp_path / "a.html"
+    path.write_text(pattern_page(default_pattern(), (0.2, 0.1), 110))
+    page = Page(1000, 600)
+    try:
+        page.open(path)
+        assert page.js('at("metres").textContent') == "[0.2000, 0.1000]"
+        page.js("document.documentElement.requestFullscreen = undefined")
+        page.js("window.lock = { release() {} }")
+        page.js("navigator.wakeLock.request = async () => { window.asked = 1; return lock }")
+        page.js('at("show").click()')
+        box = "(e => [e.left, e.width, e.height])(at('pattern').getBoundingClientRect())"
+        wanted = [0, round(200 / 25.4 * 110), round(100 / 25.4 * 110)]
+        assert page.js(box) == pytest.approx(wanted, abs=1) and page.js("asked") == 1
+        page.js('at("pattern").click()')
+        page.js('at("fill").click()')
+        wide, high = page.js("display()")
+        assert page.js("[state.side, state.deep]") == pytest.approx(
+            [wide / 110 * 25.4, high / 110 * 25.4], abs=0.1
+        )
+        assert not page.js('at("show").disabled')
+        # A tablet by name; a page that the browser zooms, or shows in a part of the display.
+        page.js("Object.defineProperty(screen, 'width', { get: () => 1.15 * innerWidth })")
+        page.js("Object.defineProperty(screen, 'height', { get: () => 1.15 * innerHeight })")
+        page.js("state.side = state.deep = 50; layout(); show()")
+        time.sleep(0.5)
+        assert "zoom to 100%" in page.js('at("trouble").textContent')
+        assert page.js('getComputedStyle(at("panel")).display') != "none"
+        page.js("show()")  # a person may know better
+        time.sleep(0.5)
+        assert page.js("body.className") == "shown"
+        page.js('hide(); at("tablet").value = "326"')
+        page.js('at("tablet").dispatchEvent(new Event("change"))')
+        assert page.js("state.ppi") == 326 and page.js('at("zoomed").hidden')
+        text = page.js("document.body.textContent")
+        assert all(word in text for word in ("Night Shift", "True Tone", "Full brightness"))
+        assert not page.problems
+    finally:
+        page.close()
 
 
 def test_page_shows_the_pattern_in_real_size(tmp_path):
