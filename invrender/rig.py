@@ -124,7 +124,8 @@ class Rig:
     def screen_sides(self) -> tuple[float, float]:
         """Width (along x) and depth (along y) of the screen's lit area."""
         size = self.screen_size
-        return (size, size) if isinstance(size, (int, float)) else (size[0], size[1])
+        wide, deep = (size[0], size[1]) if isinstance(size, (tuple, list)) else (size, size)
+        return float(wide), float(deep)
 
     @cached_property
     def screen_edges(self) -> tuple[Array, Array]:

@@ -29,7 +29,8 @@ class Scene:
     corner, edge_x, edge_y: of the screen with its bezel. pattern: values of relative radiance in
     ``pattern_shape`` (rows, columns), row 0 at +y. environment: H·2H·3, row 0 at +z. falloff: the
     display's exponent, None where it dims to no side. bezel: its shares of the screen's width and
-    depth on each side, None where there is none.
+    depth on each side, None where there is none; only `Fast`, whose edges are soft, differentiates
+    by it.
     """
 
     camera: Any
