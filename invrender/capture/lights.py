@@ -75,7 +75,9 @@ def find_lights(
     if environment is not None and gain is not None:
         if sheet is None:
             capture = replace(capture, rig=find_camera(capture.photo, capture.rig)[0])
-        lights = Lights(capture.rig, capture.pattern, environment, _rgb(gain))
+        lights = Lights(
+            capture.rig, capture.pattern, environment, _rgb(gain), device=capture.device
+        )
         return FoundLights(capture, lights, None, (*capture.warnings, *sheet_notices), sheet)
     fov_notices: tuple[Notice, ...] = ()
     # The matrices are small: more threads than one only slow each other down.

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from invrender.device import IDEAL, Device
 from invrender.files.bracket import merge_bracket
 from invrender.files.images import PHOTOS, Photo, read_image, read_photo
 from invrender.files.maps import read_maps
@@ -23,7 +24,9 @@ MIN_PHOTO = 64
 class Capture:
     """One capture: a photo of the set-up, linear RGB, with its rig and the pattern that was shown.
 
-    ``pattern`` (h, w, 3) is the ideal one, relative radiance in [0, 1], row 0 at +y. ``name`` is
+    ``pattern`` (h, w, 3) is what the display was given, linear values in [0, 1], row 0 at +y; where
+    rig.toml tells the display's curve, black and mixing, they are in it. ``device`` is the dimming
+    to the sides that rig.toml tells, for lights that are given; the ball shows it else. ``name`` is
     that of its folder.
 
     ``fov_from`` says where the rig's field of view is known from: "rig" (rig.toml), "exif", or
@@ -44,6 +47,7 @@ class Capture:
     name: str = "capture"
     unknown: frozenset[str] = frozenset()
     tilt_deviation: float | None = None
+    device: Device = IDEAL
 
 
 def load_capture(folder: str | Path) -> Capture:
@@ -71,6 +75,7 @@ def load_capture(folder: str | Path) -> Capture:
         raise InputError(f"{pattern_path}: the pattern must be relative radiance in [0, 1]")
     if not pattern.max() > 0:
         raise InputError(f"{pattern_path}: the pattern is all black")
+    told = given.device or IDEAL
     truth = environment = None
     if "sample" in given.files:
         maps = _inside(folder, given.files["sample"])
@@ -78,8 +83,9 @@ def load_capture(folder: str | Path) -> Capture:
         if (maps / "environment.exr").is_file():
             environment = read_image(maps / "environment.exr")
     return Capture(
-        photo, given.rig, np.clip(pattern, 0, 1), truth, environment, given.fov_from,
-        (*photo.warnings, *given.warnings), folder.resolve().name, given.unknown,
+        photo, given.rig, np.clip(told.shown(np.clip(pattern, 0, 1)), 0, 1), truth, environment,
+        given.fov_from, (*photo.warnings, *given.warnings), folder.resolve().name, given.unknown,
+        device=Device(falloff=told.falloff),
     )  # fmt: skip
 
 

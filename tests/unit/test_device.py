@@ -1,7 +1,9 @@
 import numpy as np
 import pytest
 
+from invrender.capture.lights import find_lights
 from invrender.device import Device
+from invrender.files.capture import load_capture
 from invrender.types import InputError
 
 PATTERN = np.random.default_rng(0).uniform(0, 1, (3, 5, 3)).astype(np.float32)
@@ -40,3 +42,16 @@ def test_dimming_is_a_power_of_the_cosine():
 def test_what_no_display_does_is_refused(field, value, message):
     with pytest.raises(InputError, match=message):
         Device(**{field: value})
+
+
+def test_a_display_that_rig_toml_tells_is_the_lights(capture):
+    """Its curve and black are in the pattern, its dimming stays with lights that are given."""
+    plain = load_capture(capture)
+    rig = capture / "rig.toml"
+    rig.write_text(rig.read_text() + "\n[device]\nfalloff = 0.7\ngamma = 1.5\nblack = 0.01\n")
+    told = load_capture(capture)
+    expected = Device(gamma=(1.5, 1.5, 1.5), black=0.01).shown(plain.pattern)
+    np.testing.assert_allclose(told.pattern, expected, atol=1e-6)
+    lights = find_lights(told, environment=np.zeros((8, 16, 3)), gain=1.0).lights
+    assert lights.device == Device(falloff=0.7)
+    assert plain.device == Device()
