@@ -26,7 +26,7 @@ class Page:
 
     def __init__(self, width=1200, height=900, site=None):
         self.own = ("file:", "data:", "about:", "blob:", *([site] if site else []))
-        self.profile = tempfile.TemporaryDirectory()
+        self.profile = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
         read, self.to = os.pipe()
         self.source, write = os.pipe()
         command = [CHROMIUM, *FLAGS, f"--window-size={width},{height}",
@@ -146,8 +146,9 @@ class Page:
                  clickCount=1)  # fmt: skip
 
     def screenshot(self, path, whole=False):
-        """Write a PNG of the window, or of the whole page."""
-        data = self("Page.captureScreenshot", captureBeyondViewport=whole)["data"]
+        """Write a PNG or JPEG of the window, or of the whole page."""
+        kind = {"format": "jpeg", "quality": 85} if Path(path).suffix == ".jpg" else {}
+        data = self("Page.captureScreenshot", captureBeyondViewport=whole, **kind)["data"]
         Path(path).write_bytes(base64.b64decode(data))
 
     def close(self):

@@ -39,7 +39,7 @@ def page(server):
 
 def picture(page, name):
     if PICTURES:
-        page.screenshot(Path(PICTURES) / f"app_{name}.png")
+        page.screenshot(Path(PICTURES) / f"app_{name}.jpg")
 
 
 def test_from_the_rig_to_a_file(server, page, tmp_path):
@@ -52,7 +52,6 @@ def test_from_the_rig_to_a_file(server, page, tmp_path):
         page.click(selector, 180)
         clicks += 1
 
-    picture(page, "start")
     click("a.primary")
     click("#rig-next")
     click("#tablet-next")
@@ -77,7 +76,6 @@ def test_from_the_rig_to_a_file(server, page, tmp_path):
     end = time.monotonic() + 60
     while not file.exists() and time.monotonic() < end:
         time.sleep(0.1)
-    picture(page, "take")
     used = server.processor_seconds() - before
     print(f"\n{clicks} clicks, {used:.1f} processor seconds, a second start included")
     assert file.read_bytes()[:4] == b"glTF"
