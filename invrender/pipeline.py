@@ -191,7 +191,26 @@ def _reconstruct(
         versions={n: version(n) for n in ("invrender", "drjit", "mitsuba", "numpy")},
     )
     estimate = Estimate(refined.maps, deviations(refined.sigma))
+    estimate = with_mirror_error(estimate, found[0].lights)
     return Result(estimate, lights, first.photo, report, pictures[1])
+
+
+def with_mirror_error(estimate: Estimate, lights: Lights) -> Estimate:
+    """The estimate with the error of the albedos that the mirror's reflectance brings.
+
+    All light is that in the mirror over its reflectance, and albedo is light over light: where the
+    reflectance was measured (``ball_reflectance_deviation``, of its logarithm) albedos are off by
+    as much, beside what they are off by anyway.
+    """
+    share = lights.fit.get("ball_reflectance_deviation", 0.0)
+    if not share:
+        return estimate
+    sigma = dict(estimate.sigma)
+    for name in ("diffuse", "specular"):
+        albedo: Array = getattr(estimate.maps, name)
+        albedo = albedo if sigma[name].ndim == albedo.ndim else albedo.mean(-1)
+        sigma[name] = np.hypot(sigma[name], share * albedo).astype(np.float32)
+    return Estimate(estimate.maps, sigma)
 
 
 def estimate_maps(

@@ -125,7 +125,7 @@ def find_fov(photo: Photo, rig: Rig, manual: tuple[float, float, float] | None =
     for tangent in np.geomspace(low, high, count):
         tried = replace(rig, fov=math.degrees(2 * math.atan(tangent)))
         try:
-            view, climbed = _search(photo, tried)
+            view, climbed = _search(photo, tried, FIELD_OF_VIEW.candidates)
         except InputError:
             continue
         scored.append((_score_measured(view, tried, climbed[0], 0), tried))
@@ -134,12 +134,16 @@ def find_fov(photo: Photo, rig: Rig, manual: tuple[float, float, float] | None =
     for _, tried in scored[: FIELD_OF_VIEW.tries]:
         try:
             for _ in range(FIELD_OF_VIEW.rounds):
-                ball = find_ball(photo, tried)
+                ball, before = find_ball(photo, tried), tried.focal(2)
                 tried = replace(tried, fov=_fov_by(ball, tried))
+                if abs(tried.focal(2) / before - 1) < FIELD_OF_VIEW.settled:
+                    break
         except InputError:
             continue
         if best is None or ball.confidence > best[0]:
             best = ball.confidence, tried.fov
+        if ball.confidence > FIELD_OF_VIEW.certain:
+            break
     if best is None:
         raise InputError(
             "neither rig.toml nor the photo's EXIF gives the field of view, and no mirror ball was "
@@ -167,8 +171,11 @@ def _climb_measured(
     return _climb(view, mirror, circle, reach, blur, evaluations)
 
 
-def _search(photo: Photo, rig: Rig) -> tuple[View, list[Array]]:
-    """The view of the search, and circles in it that may be the ball's, the likeliest first."""
+def _search(
+    photo: Photo, rig: Rig, count: int = BALL_SEARCH.candidates
+) -> tuple[View, list[Array]]:
+    """The view of the search, and up to ``count`` circles in it that may be the ball's, the
+    likeliest first."""
     size = (photo.height, photo.width)
     expected = make_ball(rig, rig.ball_centre, rig.ball_radius, size)
     if expected.radius < BALL_SEARCH.least_radius:
@@ -184,10 +191,7 @@ def _search(photo: Photo, rig: Rig) -> tuple[View, list[Array]]:
     candidates = sorted(
         _coarse(view, rig, expected), key=lambda c: -_score_measured(view, rig, c, 2)
     )
-    climbed = [
-        _climb_measured(view, rig, c, *BALL_SEARCH.climb_first)
-        for c in candidates[: BALL_SEARCH.candidates]
-    ]
+    climbed = [_climb_measured(view, rig, c, *BALL_SEARCH.climb_first) for c in candidates[:count]]
     if not climbed:
         raise InputError("no mirror ball found: the photo shows nothing where the rig puts it")
     return view, sorted(climbed, key=lambda c: -_score_measured(view, rig, c, 1))

@@ -291,6 +291,9 @@ class FieldOfView:
     widest: float = 95.0  # degrees; a 16 mm equivalent lens; by hand
     step: float = 1.15  # of the focal length, between two tries; by hand
     tries: int = 3  # likeliest ones in which the ball is fitted; by hand
+    candidates: int = 1  # places refined with each focal length; by hand
+    settled: float = 0.05  # of the focal length: a change after which no further fit is made
+    certain: float = 0.85  # confidence of a ball after which no other focal length is tried
     rounds: int = 2  # of the ball's fit, each with the field of view from the one before; by hand
 
 
