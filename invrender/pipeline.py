@@ -235,6 +235,7 @@ def estimate_maps(
         from invrender.refine.flat import flat_maps
         from invrender.refine.gauss_newton import Refined, refine
         from invrender.refine.lobes import fit_lobes
+        from invrender.refine.mirrors import take_mirrors
         from invrender.refine.posterior import explain
         from invrender.refine.priors import lobe_prior, network_prior, pooled
         from invrender.refine.several import by_pattern, explain_together, find_turn, likeliest
@@ -260,6 +261,7 @@ def estimate_maps(
             told = stage.part("initial maps")
             estimates = [reconstruct(crops[i].photo, crops[i].lights, told, keep) for i in asked]
         start = turn_maps(estimates[0].maps, -turns[asked[0]])
+        lobes = estimates[0].lobes if len(photos) == 1 else None
         with stage("refine"):
             told = stage.part("refine")
             for k, i in enumerate(asked):
@@ -295,6 +297,8 @@ def estimate_maps(
                 progress=lambda i, e: stage.progress(f"refine: step {i}, photo error {e:.4f}"),
             )  # fmt: skip
         else:
+            if lobes is not None:
+                prior = take_mirrors(photos[0], prior, lobes.maps, samples=samples)
             known = share(photos, prior, samples=samples)
             photos = known.observations
             if known.interrupted:

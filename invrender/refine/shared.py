@@ -113,7 +113,7 @@ def share(
     prior: a network's maps (H, W, 9), ``total`` their expected errors.
     """
     theta = plain_dielectric(project(prior.mean.copy()), s)
-    centres = group(theta[_grid(theta, s)], s)
+    centres = group(theta[grid(theta, s)], s)
     problem = _Problem(observations, prior, theta, centres, samples, s)
     solved = _solve(problem, s)
     z, left = problem.offsets(solved.u, solved.covariance)
@@ -205,13 +205,19 @@ def belongs(theta: Array, centres: Array, s: Settings = SHARED_SETTINGS) -> Arra
     return (weight / weight.sum(-1, keepdims=True)).astype(np.float32)
 
 
-def _grid(image: Array, s: Settings) -> tuple[Array, Array]:
+def grid(image: Array, s: Settings = SHARED_SETTINGS) -> tuple[Array, Array]:
     """Indices of the pixels that are compared."""
     rows, columns = (
         ((np.arange(n) + 0.5) / n * of).astype(np.intp)
         for n, of in ((min(s.side, m), m) for m in image.shape[:2])
     )
     return np.ix_(rows, columns)  # type: ignore[return-value]
+
+
+def parts_of(height: int, width: int, s: Settings = SHARED_SETTINGS) -> Any:
+    """Which part each pixel lies in (H·W), from 0."""
+    rows, columns = (np.arange(n) * min(s.parts, n) // n for n in (height, width))
+    return (rows[:, None] * (columns[-1] + 1) + columns).ravel()
 
 
 class _Problem:
@@ -221,7 +227,7 @@ class _Problem:
         self, observations: Sequence[Observation], prior: Prior, theta: Array, centres: Array,
         samples: int, s: Settings,
     ) -> None:  # fmt: skip
-        at = _grid(theta, s)
+        at = grid(theta, s)
         self.s, self.samples, self.observations = s, samples, observations
         self.theta = theta[at]
         self.weight = belongs(self.theta, centres, s)
@@ -251,9 +257,7 @@ class _Problem:
         none, all_ = s.metal_f0
         metal = np.clip((self.theta[..., S].mean(-1) - none) / (all_ - none), 0, 1)
         self.metal = np.einsum("hw,hwk->k", metal, self.weight) / size
-        h, w = self.theta.shape[:2]
-        rows, columns = (np.arange(n) * min(s.parts, n) // n for n in (h, w))
-        self.part = (rows[:, None] * (columns[-1] + 1) + columns).ravel()
+        self.part = parts_of(*self.theta.shape[:2], s)
         self.parts = int(self.part[-1]) + 1
         self.materials = len(centres)
         doubtful = [i for i, d in enumerate(self.dark) if d is not None]
