@@ -257,7 +257,8 @@ class _Problem:
         none, all_ = s.metal_f0
         metal = np.clip((self.theta[..., S].mean(-1) - none) / (all_ - none), 0, 1)
         self.metal = np.einsum("hw,hwk->k", metal, self.weight) / size
-        self.part = parts_of(*self.theta.shape[:2], s)
+        height, width = self.theta.shape[:2]
+        self.part = parts_of(height, width, s)
         self.parts = int(self.part[-1]) + 1
         self.materials = len(centres)
         doubtful = [i for i, d in enumerate(self.dark) if d is not None]
