@@ -124,7 +124,8 @@ class App:
             with suppress(KeyError, OSError):
                 captures.append(self.capture(id))
         return {
-            "version": version("invrender"), "captures": captures, "links": self.links,
+            "version": version("invrender"), "captures": captures,
+            "links": dict.fromkeys(self.links, True),
             "profiles": [asdict(p) for p in self.profiles()], "sizes": SIZES,
             "tablets": [t._asdict() for t in TABLETS], "shown": self.shown,
             "patterns": patterns.PATTERNS, "folder": str(self.root),

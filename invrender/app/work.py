@@ -97,6 +97,7 @@ def check(tell: Tell, folder: str, number: int) -> dict[str, Any]:
         answer |= {
             "turn": turn, "found": summary(found), "outlines": _plain(lines),
             "corners": lines["sample"].tolist(), "ball": [*found.ball.centre, found.ball.radius],
+            "markers": [] if found.sheet is None else np.round(found.sheet.corners, 1).tolist(),
         }  # fmt: skip
     except InputError as error:
         answer["problem"] = _without_paths(str(error), capture_folder)

@@ -2,7 +2,7 @@
 import { h, svg, api, attempt, go, sentence, percent } from "./ui.js";
 import { state, captureOf, discard } from "./app.js";
 
-const LINES = [["ball", "ball", "#7be08b"], ["horizon", "horizon in it", "#f2d75c"], ["screen", "screen in it", "#ff7a6b"], ["sample", "sample", "#62c2ff"]];
+const LINES = [["ball", "ball", "#7be08b"], ["horizon", "horizon in it", "#f2d75c"], ["screen", "screen in it", "#ff7a6b"], ["sample", "sample", "#62c2ff"], ["marker", "sheet's markers", "#ff7df0"]];
 const CORNERS = ["lower left", "lower right", "upper right", "upper left"];
 const DELAY = 700; // ms after the last movement
 
@@ -53,6 +53,7 @@ export function check(main, id) {
   function lines(a) {
     const focused = document.activeElement?.dataset?.handle;
     overlay.replaceChildren();
+    if (!off.has("marker")) for (const quad of a.markers || []) overlay.append(svg("polygon", { class: "line marker", points: quad.map((p) => p.join(",")).join(" ") }));
     for (const [name] of LINES) {
       if (off.has(name) || name === "sample" || !a.outlines?.[name]) continue;
       overlay.append(svg("polygon", { class: `line ${name}`, points: a.outlines[name].map((p) => p.join(",")).join(" ") }));
@@ -112,6 +113,7 @@ export function check(main, id) {
     const top = h(`div.verdict${kind && "." + kind}`, { role: "status" }, h("span.mark", { "aria-hidden": "true" }, mark),
       h("div", {}, h("b", {}, words[0]), h("span.soft", {}, a?.problem ? sentence(a.problem) : words[1])));
     const list = a?.found?.warnings.length ? h("ul.warnings", {}, a.found.warnings.map((w) => h("li", {}, sentence(w.text)))) : null;
+    const advice = a?.found?.advice?.length ? h("details", { open: a.found.warnings.length === 0 }, h("summary", {}, "To do better next time"), h("ul.warnings.calm", {}, a.found.advice.map((w) => h("li", {}, sentence(w.text))))) : null;
     const hint = a?.problem && a.size ? h("p.small.soft", {}, "The handles can be dragged: put the green ring onto the ball, the blue square onto the sample.") : null;
     const f = a?.found;
     const table = f && h("details", {}, h("summary", {}, "Numbers"), h("table", {}, [
@@ -122,7 +124,7 @@ export function check(main, id) {
       f.notes.map((n) => h("p.small.soft", {}, sentence(n.text))));
     make.disabled = !f;
     const fixed = a?.fix && Object.keys(a.fix).length > 0;
-    return [top, list, hint, table, h("div.field", {}, h("label", { for: "size" }, "Size of the maps"), size),
+    return [top, list, advice, hint, table, h("div.field", {}, h("label", { for: "size" }, "Size of the maps"), size),
       h("div.actions", {}, make), h("div.actions", {}, turn, fixed ? again : null, remove)].filter(Boolean);
   }
   draw();
