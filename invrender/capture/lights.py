@@ -22,7 +22,7 @@ from invrender.capture.orientation import find_ball_and_orientation, not_the_pat
 from invrender.capture.response import Response
 from invrender.capture.screen import Screen, fit_screen
 from invrender.capture.settings import PATTERN_CHECK, SCREEN_FIT, TABLE_LEVEL, UNFOLDING
-from invrender.capture.sheet import FoundSheet, undone, use_paper, use_sheet
+from invrender.capture.sheet import FoundSheet, moved_circle, undone, use_paper, use_sheet
 from invrender.files.capture import Capture
 from invrender.files.images import Photo
 from invrender.lights import Lights
@@ -71,7 +71,9 @@ def find_lights(
         print(found.lights.gain, [notice.text for notice in found.notices])
     """
     with threadpool_limits(1, "blas"):
+        photo = capture.photo
         capture, sheet, sheet_notices = use_sheet(capture)
+        ball = moved_circle(sheet, ball, photo, capture.photo)
     if environment is not None and gain is not None:
         if sheet is None:
             capture = replace(capture, rig=find_camera(capture.photo, capture.rig)[0])

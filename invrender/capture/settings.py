@@ -216,6 +216,7 @@ class SheetFit:
     # Pixels of a marker where the rig expects it, in the copy that is searched, and in the next one
     # where there are any.
     copy_markers: tuple[float, ...] = (40.0, 80.0)  # by hand
+    skipped: float = 0.8  # of the copy's shrinking, done by leaving pixels out; by hand
     toe: float = 0.1  # of the median radiance, added before the logarithm; by hand
     brightest: float = 20.0  # of the median radiance, where the copy is cut; by hand
     least_level: float = 1e-6  # of the maximum, the least median; by hand

@@ -39,6 +39,8 @@ from invrender.sheet import (
 from invrender.sphere import resample_environment
 from invrender.types import Array, InputError, Mask, Notice
 
+Circle = tuple[float, float, float]
+
 
 @dataclass(frozen=True)
 class FoundSheet:
@@ -50,7 +52,8 @@ class FoundSheet:
     (x, y) the principal point lies from that photo's middle, in its widths; distortion: k1, of
     x·(1 + k1·r²) with r the tangent of the angle from the axis; each with its deviation. residual:
     of the corners, root mean square in pixels. white: (k, 3) places of plain paper, metres, and
-    white_radiance (k, 3) what the photo shows there.
+    white_radiance (k, 3) what the photo shows there. turns: quarters by which the photo was turned,
+    counter-clockwise.
     """
 
     ids: NDArray[np.int_]
@@ -66,6 +69,7 @@ class FoundSheet:
     residual: float
     white: Array
     white_radiance: Array
+    turns: int = 0
 
 
 @dataclass(frozen=True)
@@ -181,6 +185,7 @@ def use_sheet(capture: Capture) -> tuple[Capture, FoundSheet | None, tuple[Notic
         residual=residual,
         white=_on_table(white),
         white_radiance=radiance,
+        turns=turns,
     )
     used = replace(
         capture, photo=photo, rig=posed, fov_from="sheet", tilt_deviation=found.tilt_deviation
@@ -211,7 +216,7 @@ def _detected(image: Array, scale: float, wanted: float) -> tuple[NDArray[np.int
     import cv2
 
     height, width = image.shape
-    step = max(1, math.floor(0.5 / scale))
+    step = max(1, math.floor(SHEET_FIT.skipped / scale))
     image = image[step // 2 :: step, step // 2 :: step]
     if scale < 1:  # OpenCV reads no strided images
         size = max(1, round(width * scale)), max(1, round(height * scale))
@@ -270,6 +275,19 @@ def _another(sheet: Sheet) -> InputError:
         "from its middle: print that with 'invrender pattern --rig rig.toml -o guide.pdf', or "
         "correct rig.toml, and lay it flat"
     )
+
+
+def moved_circle(
+    sheet: FoundSheet | None, circle: Circle | None, before: Photo, after: Photo
+) -> Circle | None:
+    """Where a circle (x, y, radius) of the photo lies in the one that `use_sheet` made of it."""
+    if sheet is None or circle is None:
+        return circle
+    width, height = (before.width, before.height)[:: -1 if sheet.turns % 2 else 1]
+    x, y = _turned_pixels(np.array(circle[:2]), sheet.turns, before)
+    x += (after.width - width) / 2 - sheet.principal[0] * width
+    y += (after.height - height) / 2 - sheet.principal[1] * width
+    return float(x), float(y), circle[2]
 
 
 def _cut(count: int) -> tuple[Notice, ...]:

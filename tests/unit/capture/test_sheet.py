@@ -14,6 +14,7 @@ from invrender.capture.sheet import (
     _Camera,
     _fit,
     _from_homography,
+    moved_circle,
     screen_gain,
     use_paper,
     use_sheet,
@@ -44,6 +45,14 @@ def tilt_off(found, true):
 @pytest.fixture(scope="module")
 def image():
     return sheet_photo(HELD, *SIZE, gain=GAIN, room=0, blur=0.8, noise=0.02, vignetting=0.2)
+
+
+OPTICS = {"k1": -0.05, "centre": (0.004, -0.003)}
+
+
+@pytest.fixture(scope="module")
+def bent():
+    return sheet_photo(HELD, *SIZE, **OPTICS)
 
 
 # --- the camera ---------------------------------------------------------------------------------
@@ -127,12 +136,12 @@ def test_exposure_does_not_matter(image, exposure):
     assert tilt_off(a.rig, b.rig) < 1e-2
 
 
-@pytest.mark.parametrize("k1", [-0.05, 0.04])
-def test_optics_are_undone(k1):
-    image = sheet_photo(HELD, *SIZE, k1=k1, centre=(0.004, -0.003))
-    used, found, _ = use_sheet(captured(image))
-    assert found.distortion == pytest.approx(k1, abs=max(4 * found.distortion_deviation, 2e-3))
-    assert found.principal == pytest.approx((0.004, -0.003), abs=2e-3)
+def test_optics_are_undone(bent):
+    used, found, _ = use_sheet(captured(bent))
+    assert found.distortion == pytest.approx(
+        OPTICS["k1"], abs=max(4 * found.distortion_deviation, 2e-3)
+    )
+    assert found.principal == pytest.approx(OPTICS["centre"], abs=2e-3)
     assert tilt_off(used.rig, HELD) < 0.1
     _, found, _ = use_sheet(replace(used, rig=RIG, fov_from="unknown"))
     assert abs(found.distortion) < 0.004
@@ -143,6 +152,22 @@ def test_a_turned_photo_is_set_upright(image, turns):
     used, _, notices = use_sheet(captured(np.rot90(image, -turns)))
     assert [n.code for n in notices] == ["photo-turned"] and f"{90 * turns}°" in notices[0].text
     assert tilt_off(used.rig, HELD) < 0.1
+
+
+@pytest.mark.parametrize("turns", [0, 1, 2, 3])
+def test_a_ball_by_hand_moves_with_the_photo(bent, turns):
+    image, focal, x = bent, HELD.focal(SIZE[1]), HELD.project(RIG.ball_centre, *SIZE)
+    q = (x - [SIZE[1] / 2, SIZE[0] / 2]) / focal
+    x = [SIZE[1] / 2, SIZE[0] / 2] + focal * q * (1 + OPTICS["k1"] * (q @ q))
+    x = x + np.array(OPTICS["centre"]) * SIZE[1]
+    for _ in range(-turns % 4):  # where it lies in the turned photo
+        width = image.shape[1]
+        image, x = np.rot90(image), np.array([x[1], width - x[0]])
+    capture = captured(image)
+    used, found, _ = use_sheet(capture)
+    moved = moved_circle(found, (*x, 20.0), capture.photo, used.photo)
+    at = used.rig.project(RIG.ball_centre, used.photo.height, used.photo.width)
+    assert found.turns == turns and moved == pytest.approx((*at, 20.0), abs=1.5)
 
 
 @pytest.mark.parametrize("lies", [1, 2])
