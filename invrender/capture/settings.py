@@ -267,6 +267,7 @@ class SheetFit:
     screen_cells: int = 24  # of the screen, a side; by hand
     environment_rows: int = 32  # by hand
     room_deviation: float = 0.5  # of the room's factor about 1; by hand
+    vignetting_deviation: float = 0.3  # of the light that a corner lacks; by hand
     gains_differ: float = 3.0  # deviations between the gains by paper and ball; by hand
     scale: float = 0.02  # of the ball's radius, by which it contradicts the sheet's; by hand
 

@@ -52,7 +52,8 @@ class FoundSheet:
     (x, y) the principal point lies from that photo's middle, in its widths; distortion: k1, of
     x·(1 + k1·r²) with r the tangent of the angle from the axis; each with its deviation. residual:
     of the corners, root mean square in pixels. white: (k, 3) places of plain paper, metres, and
-    white_radiance (k, 3) what the photo shows there. turns: quarters by which the photo was turned,
+    white_radiance (k, 3) what the photo shows there; white_aside: (k,) their squared distance from
+    the optical axis, a corner's being 1. turns: quarters by which the photo was turned,
     counter-clockwise.
     """
 
@@ -69,6 +70,7 @@ class FoundSheet:
     residual: float
     white: Array
     white_radiance: Array
+    white_aside: Array
     turns: int = 0
 
 
@@ -185,6 +187,7 @@ def use_sheet(capture: Capture) -> tuple[Capture, FoundSheet | None, tuple[Notic
         residual=residual,
         white=_on_table(white),
         white_radiance=radiance,
+        white_aside=_aside(photo, posed, _on_table(white)),
         turns=turns,
     )
     used = replace(
@@ -572,6 +575,12 @@ def _white_radiance(photo: Photo, rig: Rig, white: Array, side: float) -> tuple[
     return white[use][clear], np.median(seen[clear], 1)
 
 
+def _aside(photo: Photo, rig: Rig, points: Array) -> Array:
+    """Squared distances (k,) of points from the photo's middle, a corner's being 1."""
+    off = rig.project(points, photo.height, photo.width) - _middle(photo)
+    return np.asarray((off**2).sum(-1) / (_middle(photo) ** 2).sum())
+
+
 def undone(sheet: FoundSheet | None, response: Response) -> FoundSheet | None:
     """The sheet as a photo shows it whose tone curve was undone."""
     if sheet is None:
@@ -584,7 +593,8 @@ def screen_gain(found: FoundSheet, lights: Lights) -> tuple[Array, float] | None
     """The screen's gain (3,) by the light on the paper, and the deviation of its logarithm.
 
     The paper shows screen and room together. ``lights`` has the pattern, and the room up to a
-    factor, which is fitted too: a wrong reflectance of the ball does not matter. None where too
+    factor, which is fitted too: a wrong reflectance of the ball does not matter. So is what the
+    lens loses towards the corners. None where too
     little paper is to be seen. The paper's own reflectance is the most of the deviation.
     """
     if len(found.white) < SHEET_FIT.least_patches:
@@ -597,21 +607,17 @@ def screen_gain(found: FoundSheet, lights: Lights) -> tuple[Array, float] | None
     room = room_irradiance(lights.rig, found.white, environment)
     seen = found.white_radiance * (math.pi / PAPER)
     weight = 1 / (SHEET_FIT.patch_noise * np.maximum(seen, TINY))
-    # Unknowns: the three gains over the lights' own, and the room's factor.
+    # Unknowns: the three gains over the lights' own, the room's factor, and vignetting.
     given = np.maximum(np.broadcast_to(np.asarray(lights.gain, float), 3), TINY)
-    n = len(seen)
-    matrix = np.zeros((3, n, 4))
-    for c in range(3):
-        matrix[c, :, c] = screen[:, c] * given[c]
-        matrix[c, :, 3] = room[:, c]
-    matrix = (matrix * weight.T[..., None]).reshape(-1, 4)
-    wanted = (seen * weight).T.ravel()
-    ridge = np.array([0, 0, 0, 1 / SHEET_FIT.room_deviation])
-    matrix, wanted = np.vstack([matrix, np.diag(ridge)]), np.append(wanted, ridge)
-    done = least_squares(
-        lambda x: matrix @ x - wanted, np.ones(4), jac=lambda x: matrix, loss="soft_l1"
-    )
-    covariance = np.linalg.pinv(matrix.T @ matrix)
+
+    def errors(x: Array) -> Array:
+        bright = screen * given * x[:3] + x[3] * room
+        off = (bright * (1 - x[4] * found.white_aside[:, None]) - seen) * weight
+        prior = (x[3] - 1) / SHEET_FIT.room_deviation, x[4] / SHEET_FIT.vignetting_deviation
+        return np.append(off.ravel(), prior)
+
+    done = least_squares(errors, np.array([1.0, 1, 1, 1, 0]), loss="soft_l1")
+    covariance = np.linalg.pinv(done.jac.T @ done.jac)
     gain = given * done.x[:3]
     if not np.all(gain > 0):
         return None
