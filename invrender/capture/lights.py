@@ -172,7 +172,7 @@ def _measure(
     rig = level_table(capture.photo, capture.rig, ball)
     image = trace_image(rig, ball)
     photo = remove_glare(capture.photo, rig, image)
-    screen = fit_screen(photo, rig, image, capture.pattern, curve=curve)
+    screen = fit_screen(photo, rig, image, capture.pattern, capture.device, curve=curve)
     lit = capture.pattern, screen.gain, screen.device
     fit = _fit_numbers(screen, rig)
     if _shows_another_pattern(screen, ball):

@@ -59,18 +59,25 @@ class Screen:
 
 
 def fit_screen(
-    photo: Photo, rig: Rig, image: BallImage, pattern: Array, *, curve: bool = True
+    photo: Photo,
+    rig: Rig,
+    image: BallImage,
+    pattern: Array,
+    device: Device = IDEAL,
+    *,
+    curve: bool = True,
 ) -> Screen:
     """Register the ``pattern`` (h, w, 3), relative radiance, with the ball's image of the screen.
 
-    Gain and blur are fitted first, for the screen as it should be. Where that fits worse than to
+    Gain and blur are fitted first, for the screen as it should be, a ``device`` that is known among
+    that. Where that fits worse than to
     `SCREEN_FIT.poor`, or the screen is saturated, its pose and the display's curve are fitted too;
     where more than `SCREEN_FIT.no_curve` is saturated the curve cannot be told from the gain and is
     taken as straight. Then what the errors ask for: the display's other properties, and an 8-bit
     file's tone curve, unless ``curve`` is false. Raises `InputError` if the ball cannot show the
     screen, or shows it saturated or dark.
     """
-    fit = _Fit(photo, rig, image, pattern)
+    fit = _Fit(photo, rig, image, pattern, device)
     u = fit.start()
     for stage in SCREEN_FIT.stages[-2:]:
         u = fit.solve(u, *stage)
@@ -154,7 +161,9 @@ def _blur(image: Array, sigma: float) -> Array:
 class _Fit:
     """The ball's image around the screen, the rays that its sub-pixels see, and the fit's steps."""
 
-    def __init__(self, photo: Photo, rig: Rig, image: BallImage, pattern: Array) -> None:
+    def __init__(
+        self, photo: Photo, rig: Rig, image: BallImage, pattern: Array, device: Device = IDEAL
+    ) -> None:
         self.rig, self.full = rig, pattern
         self.free = np.zeros(_COUNT, bool)
         self.free[_GAIN], self.free[_BLUR] = True, True
@@ -191,6 +200,11 @@ class _Fit:
         coarse = resize_pattern(pattern, min(SCREEN_FIT.cells, len(pattern)))
         self.pattern = np.maximum(coarse.astype(float), SCREEN_FIT.least_pattern)
         self.prior_mean = np.zeros(_COUNT)
+        self.prior_mean[_GAMMA] = np.log(device.gamma)
+        self.prior_mean[[_FALLOFF, _BLACK]] = device.falloff, device.black
+        mixing = np.asarray(device.mixing)
+        mixing = mixing / mixing.sum(1, keepdims=True)  # the rest is the gain's
+        self.prior_mean[_MIXING] = [mixing[pair] for pair in _PAIRS]
         self.prior_mean[_BLUR] = math.log(SCREEN_FIT.expected_blur)
         self.prior_mean[_COLOUR] = math.log(SCREEN_FIT.colour_blur / step)
         self.prior = np.zeros((_COUNT, _COUNT))
@@ -337,7 +351,7 @@ class _Fit:
 
     def device(self, u: Array) -> Device:
         """The display that ``u`` describes."""
-        gamma = tuple(np.exp(u[_GAMMA]).tolist()) if self.free[_GAMMA].any() else IDEAL.gamma
+        gamma = tuple(np.exp(u[_GAMMA]).tolist())
         red, green, blue = ((r, g, b) for r, g, b in self.mixing(u).tolist())
         return Device(float(u[_FALLOFF]), gamma, float(u[_BLACK]), (red, green, blue))
 

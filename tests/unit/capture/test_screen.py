@@ -117,6 +117,16 @@ def test_a_display_that_dims_and_mixes_keeps_its_gain():
     np.testing.assert_allclose(found.device.gamma, DISPLAY.gamma, atol=0.03)
 
 
+def test_a_display_that_is_told_needs_no_fit():
+    pattern = noise_pattern()
+    image = photograph(RIG, *SIZE, pattern=DISPLAY.shown(pattern), gain=GAIN, falloff=0.9)
+    found = screen.fit_screen(Photo(image), RIG, IMAGE, pattern, DISPLAY)
+    np.testing.assert_allclose(found.gain, GAIN, rtol=0.01)
+    assert found.device.falloff == 0.9  # as told
+    np.testing.assert_allclose(found.device.mixing, DISPLAY.mixing, atol=1e-9)
+    np.testing.assert_allclose(found.device.gamma, DISPLAY.gamma, rtol=0.01)
+
+
 def noise_pattern():
     """Blocks of many levels, (64, 64, 3)."""
     levels = np.random.default_rng(3).choice([0.02, 0.05, 0.15, 0.4, 1.0], (8, 8, 3))
