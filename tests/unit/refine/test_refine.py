@@ -310,3 +310,13 @@ def test_coarse_error_sees_lights_and_not_texture():
     assert coarse_error(left, photo, left[..., 0] > photo[..., 0]) == 0
     assert coarse_error(photo[:1, :1], photo[:1, :1], nowhere[:1, :1]) == 0
     assert np.isfinite(coarse_error(photo, 0 * photo, nowhere))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_usual_f0_unless_the_photo_says_otherwise(renderer, environment, seed):
+    """A strong texture leaves f0 open: it is the usual one then, not what fits slightly better."""
+    rng = np.random.default_rng(seed)
+    truth = constant_maps(SIZE, SIZE, (0.4, 0.3, 0.2), 0.04, 0.6)
+    truth.diffuse *= rng.uniform(0.4, 1.6, (SIZE, SIZE, 3)).astype(np.float32)
+    maps = fit_lobes(photo_of(truth, environment), renderer)
+    assert np.abs(maps.specular - 0.04).max() < 0.015

@@ -205,3 +205,13 @@ def test_scaled_renderer_is_one_of_scaled_lights(renderer):
     wanted = Fast(make_scene(Rig(), block_pattern(64), color * ROOM, 2.0 * color[::-1]))
     found = renderer.scaled(color[::-1], color)
     np.testing.assert_allclose(found.render(maps), wanted.render(maps), rtol=2e-3, atol=1e-5)
+
+
+def test_paint_of_two_sheens_is_two_materials():
+    """And one whose roughness differs by little is one."""
+    found = {}
+    for off in (0.05, 0.3):
+        maps = constant_maps(SIZE, SIZE, 0.2, 0.04, 0.3)
+        maps.roughness[: SIZE // 2] += off
+        found[off] = len(group(to_theta(maps)))
+    assert found == {0.05: 1, 0.3: 2}
