@@ -19,7 +19,7 @@ from invrender.types import Array, InputError
 
 PAPER = 0.80  # reflectance of plain office paper
 PAPER_DEVIATION = 0.05  # of that, from one paper to another
-INK = 0.05  # reflectance of a printer's black, about
+INK_REFLECTANCE = 0.05  # reflectance of a printer's black, about
 # What A4 and Letter, or A3 and Ledger, have in common, metres: one sheet fits on either.
 PAPERS = {"A4 or Letter": (0.2794, 0.210), "A3 or Ledger": (0.4191, 0.2794)}
 UNPRINTED = 0.006  # metres along the paper's edges where printers may leave nothing
@@ -187,7 +187,7 @@ def draw_sheet(sheet: Sheet, resolution: float) -> Array:
         down = _shares(-rows[v0 : v1 + 1], np.linspace(-top, -bottom, MODULES + 1))
         across = _shares(columns[u0 : u1 + 1], np.linspace(left, right, MODULES + 1))
         black = down @ (1 - bits) @ across.T
-        image[v0 : v0 + len(black), u0 : u0 + black.shape[1]] -= (PAPER - INK) * black
+        image[v0 : v0 + len(black), u0 : u0 + black.shape[1]] -= (PAPER - INK_REFLECTANCE) * black
     return image
 
 

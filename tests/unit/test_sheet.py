@@ -9,7 +9,7 @@ import pytest
 from invrender.rig import Rig
 from invrender.sheet import (
     BALL_CLEAR,
-    INK,
+    INK_REFLECTANCE,
     PAPER,
     PAPERS,
     UNPRINTED,
@@ -53,7 +53,9 @@ def test_the_picture_has_the_markers_where_the_geometry_says():
     sheet = capture_sheet(Rig())
     resolution = 5000
     image = draw_sheet(sheet, resolution)
-    assert image.min() == pytest.approx(INK, abs=1e-6) and image.max() == np.float32(PAPER)
+    assert image.min() == pytest.approx(INK_REFLECTANCE, abs=1e-6) and image.max() == np.float32(
+        PAPER
+    )
     detector = cv2.aruco.ArucoDetector(marker_dictionary())
     corners, ids, _ = detector.detectMarkers((image * 255).astype(np.uint8))
     assert sorted(ids.ravel()) == sorted(sheet.ids)
