@@ -6,7 +6,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +15,8 @@ import numpy as np
 
 from invrender.capture.crop import crop_mask, crop_sample
 from invrender.capture.lights import FoundLights, find_lights
-from invrender.files.capture import load_capture
+from invrender.capture.which_pattern import find_pattern
+from invrender.files.capture import Capture, load_capture, load_set, set_patterns
 from invrender.files.output import check_output
 from invrender.lights import Lights
 from invrender.maps import Estimate, Maps, map_errors, resize_maps, turn_maps
@@ -23,7 +24,7 @@ from invrender.pattern.default import default_pattern
 from invrender.report.notices import map_notices
 from invrender.report.report import Report
 from invrender.report.result import SAMPLES, Result
-from invrender.types import Array, InputError, Mask
+from invrender.types import Array, InputError, Mask, Notice
 
 if TYPE_CHECKING:  # Dr.Jit compiles where the refinement is imported
     from invrender.refine.gauss_newton import Observation, Refined
@@ -106,9 +107,10 @@ def refine_capture(
     check_output(out, folders, megabytes=MEGABYTES[0] * size**2 + MEGABYTES[1])
     stage = Stages(progress)
     with stage("read"):
-        captures = [load_capture(f) for f in folders]
+        read = [_read(f) for f in folders]
     with stage("lights"):
-        found = [find_lights(c, ball=ball, environment=environment, gain=gain) for c in captures]
+        known = {"ball": ball, "environment": environment, "gain": gain}
+        found = _find_all([(c, p) for captures, p in read for c in captures], known, stage)
     unfinished = out.parent / f".{out.name}.unfinished"
     result = _reconstruct(found, stage, size, init, samples, unfinished)
     with stage("write"):
@@ -117,6 +119,49 @@ def refine_capture(
         raise KeyboardInterrupt(f"interrupted; {out} holds the best maps so far")
     shutil.rmtree(unfinished, ignore_errors=True)
     return result.report
+
+
+def _read(folder: Path) -> tuple[list[Capture], list[Array]]:
+    """A folder's captures, and the set of patterns that they show, if it is one."""
+    if folder.is_dir() and set_patterns(folder):
+        return load_set(folder)
+    return [load_capture(folder)], []
+
+
+def _find_all(
+    captures: Sequence[tuple[Capture, list[Array]]], known: dict[str, Any], stage: Stages
+) -> list[FoundLights]:
+    """The lights of each capture; those of several that have none, or that are there twice, are
+    left out, which the first one's notices say. Raises `InputError` where none is left."""
+    if len(captures) == 1 and not captures[0][1]:
+        return [find_lights(captures[0][0], **known)]
+    found: list[FoundLights] = []
+    problems: list[InputError] = []
+    notices = []
+    told = stage.part("lights")
+    for i, (capture, patterns) in enumerate(captures):
+        try:
+            twin = next((c for c, _ in captures[:i] if _same(c, capture)), None)
+            if twin is not None:
+                raise InputError(f"it is the same photo as {twin.name}")
+            if patterns:
+                capture, which = find_pattern(capture, patterns)
+                text = f"{capture.name} shows pattern {which + 1} of the set"
+                notices.append(Notice("pattern-of-set", text))
+            found.append(find_lights(capture, **known))
+        except InputError as error:
+            problems.append(error)
+            notices.append(Notice("photo-left-out", f"{capture.name} was left out: {error}"))
+        told((i + 1) / len(captures))
+    if not found:
+        raise problems[0]
+    return [replace(found[0], notices=(*found[0].notices, *notices)), *found[1:]]
+
+
+def _same(a: Capture, b: Capture) -> bool:
+    return a.photo.image.shape == b.photo.image.shape and np.array_equal(
+        a.photo.image, b.photo.image
+    )
 
 
 def reconstruct(
@@ -170,13 +215,25 @@ def _reconstruct(
         baked = baked_light(refined.maps.diffuse, renderer, samples)
         coarse = coarse_error(pictures[1], first.photo, first.clipped)
         notices = map_notices(found[0].lights, first.clipped, refined, init, baked, coarse)
+        names = [f.capture.name for f in found]
+        left_out = [names[i] for i in getattr(refined, "left_out", [])]
+        notices += [
+            Notice(
+                "photo-left-out",
+                f"{name} was left out: it does not show what the other photos show (another "
+                "sample, moved, or blurred)",
+            )
+            for name in left_out
+        ]
+        used = [name for name in names if name not in left_out]
+        each = dict(zip(used, getattr(refined, "photo_errors", []), strict=False))
     errors, capture = None, found[0].capture
     if capture.truth is not None:
         truth = resize_maps(capture.truth, size, size)
         errors = {"initial": map_errors(start, truth), "refined": map_errors(refined.maps, truth)}
     report = Report(
         status="interrupted" if refined.interrupted else "done",
-        capture=" + ".join(f.capture.name for f in found),
+        capture=" + ".join(names),
         size=size,
         init=init,
         sample_size=lights.rig.sample_size,
@@ -188,6 +245,7 @@ def _reconstruct(
         warnings=[*found[0].notices, *notices],
         notes=list(found[0].capture.photo.notes),
         map_error=errors,
+        photos=each,
         versions={n: version(n) for n in ("invrender", "drjit", "mitsuba", "numpy")},
     )
     estimate = Estimate(refined.maps, deviations(refined.sigma))
@@ -289,8 +347,11 @@ def estimate_maps(
         elif measured:
             if init != "flat":
                 prior = likeliest(photos, [*priors, pooled(priors)], samples)
+            known = share(photos, prior, samples=samples)
+            photos = known.observations
             told = stage.part("refine")
-            result = explain_together(photos, prior, samples=samples, progress=told)
+            result = explain_together(photos, known.prior, samples=samples, progress=told)
+            result.factors = known.factors
         elif init == "flat":
             result = refine(
                 photos, prior, samples=samples,

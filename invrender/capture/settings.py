@@ -310,6 +310,15 @@ class Cropping:
 
 
 @dataclass(frozen=True)
+class WhichPattern:
+    """Of a set's patterns; chosen by hand: halves, gradients and stripes of one set are alike to
+    0.9 at most."""
+
+    alike: float = 0.6  # least correlation with the pattern that is shown
+    better: float = 0.03  # than with any other
+
+
+@dataclass(frozen=True)
 class BallShape:
     """Hemisphere or full sphere, where nobody states it: `invrender.capture.orientation`."""
 
@@ -535,6 +544,7 @@ RIM_FIT = RimFit()
 SQUARE_FIT = SquareFit()
 SHEET_FIT = SheetFit()
 ORIENTATION = Orientation()
+WHICH_PATTERN = WhichPattern()
 BALL_SHAPE = BallShape()
 FIELD_OF_VIEW = FieldOfView()
 CROPPING = Cropping()

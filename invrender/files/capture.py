@@ -89,6 +89,42 @@ def load_capture(folder: str | Path) -> Capture:
     )  # fmt: skip
 
 
+def load_set(folder: str | Path) -> tuple[list[Capture], list[Array]]:
+    """Read a folder of photos under a set of patterns: the captures, and the patterns of which each
+    shows one.
+
+    Its patterns are ``pattern_1.*``, ``pattern_2.*`` and so on, and its photos ``photo_1.*`` and so
+    on, in any order. Every capture has the first pattern until `invrender.capture.which_pattern`
+    finds its own. A photo that cannot be read is told of in `InputError`.
+    """
+    folder = Path(folder)
+    names = sorted(set_patterns(folder), key=lambda p: (len(p.stem), p.stem))
+    patterns = [np.clip(read_image(path), 0, 1) for path in names]
+    truth = environment = None
+    captures = []
+    for path in find_photos(folder):
+        photo = read_photo(path)
+        check_photo(photo, str(path))
+        given = read_rig(folder / "rig.toml", fov=photo.fov)
+        if "sample" in given.files and truth is None:
+            maps = _inside(folder, given.files["sample"])
+            truth = read_maps(maps)
+            if (maps / "environment.exr").is_file():
+                environment = read_image(maps / "environment.exr")
+        captures.append(Capture(
+            photo, given.rig, patterns[0], truth, environment, given.fov_from,
+            (*photo.warnings, *given.warnings), f"{folder.resolve().name}/{path.stem}",
+            given.unknown,
+        ))  # fmt: skip
+    return captures, patterns
+
+
+def set_patterns(folder: Path) -> list[Path]:
+    """The files of a set of patterns in a folder; none where it is of one pattern."""
+    files = [p for p in folder.iterdir() if re.fullmatch(r"pattern_\d+\.(png|exr)", p.name.lower())]
+    return files if len(files) > 1 else []
+
+
 def find_photos(folder: Path) -> list[Path]:
     """The photo of a capture's folder, ``photo.*``, or its exposures, ``photo_1.*`` and so on.
 

@@ -20,8 +20,8 @@ class Report:
     sample_size: metres. seconds: by stage. photo_error: RMS difference of the re-rendered maps from
     the photo over its mean, "initial" and "refined". capture_fit: the screen's ``gain`` (RGB) and
     the numbers of `invrender.Lights.fit`, the ball's place. map_error: RMSE against the truth,
-    "initial" and "refined", where the capture has one. notes: what was done to the photo's values
-    as they were read.
+    "initial" and "refined", where the capture has one. photos: of several, the RMS difference
+    of each, by name. notes: what was done to the photo's values as they were read.
     """
 
     status: str
@@ -38,6 +38,7 @@ class Report:
     map_error: dict[str, dict[str, float]] | None
     versions: dict[str, str]
     notes: list[Notice] = field(default_factory=list)
+    photos: dict[str, float] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """As ``report.json`` has it."""

@@ -1,0 +1,1 @@
+"""Which pattern of a set a photo shows."""
