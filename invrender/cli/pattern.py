@@ -39,6 +39,14 @@ def add_parser(commands: Any) -> None:
         help="a common tablet by name, e.g. 'iPad Pro 11', for its display's size and --ppi; -o "
         "FILE.toml writes its rig.toml",
     )
+    parser.add_argument(
+        "--set",
+        type=int,
+        dest="count",
+        metavar="N",
+        help="a set of 2, 3, 5 or 8 patterns, one photo under each: pattern_1.png and so on in the "
+        "folder that -o names, and pattern.html, which shows one after another",
+    )
     parser.add_argument("--mirrored", action="store_true", help="as the device must show it")
     parser.add_argument(
         "--optimise",
@@ -65,6 +73,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
     from invrender.sampling import resize_pattern
     from invrender.types import InputError
 
+    if args.count is not None:
+        return _write_set(args, console)
     suffix = args.out.suffix.lower()
     tablet, others = find_tablet(args.device) if args.device is not None else (None, [])
     if suffix == ".toml" and tablet is None:
@@ -141,4 +151,35 @@ def run(args: argparse.Namespace, console: Console) -> int:
         image = mirrored(image) if args.mirrored else image
         (write_png if suffix == ".png" else write_exr)(args.out, image)
     console.print(f"wrote {args.out}")
+    return 0
+
+
+def _write_set(args: argparse.Namespace, console: Console) -> int:
+    """The images of a set for the photos' folder, and the page that shows them."""
+    from invrender.files.output import check_output
+    from invrender.files.rig_toml import read_rig
+    from invrender.files.write import atomic_path, write_png
+    from invrender.pattern.display import set_page
+    from invrender.pattern.sets import pattern_set
+    from invrender.pattern.tablets import find_tablet, tablet_rig
+    from invrender.rig import Rig
+    from invrender.types import InputError
+
+    if args.optimise or args.mirrored or args.size is not None or args.out.suffix:
+        raise InputError("--set writes into a folder, and takes --rig, --device or --ppi alone")
+    if args.rig and args.device:
+        raise InputError("--device gives what --rig would: leave it out")
+    patterns = pattern_set(args.count)
+    rig, ppi = read_rig(args.rig).rig if args.rig else Rig(), args.ppi
+    if args.device is not None:
+        tablet, _ = find_tablet(args.device)
+        rig, ppi = tablet_rig(tablet), tablet.ppi
+    check_output(args.out, [args.rig] if args.rig else [])
+    page = set_page(patterns, max(rig.screen_sides), ppi)
+    args.out.mkdir(parents=True, exist_ok=True)
+    for i, pattern in enumerate(patterns, 1):
+        write_png(args.out / f"pattern_{i}.png", pattern)
+    with atomic_path(args.out / "pattern.html") as path:
+        path.write_text(page, encoding="utf-8")
+    console.print(f"wrote {len(patterns)} patterns and pattern.html to {args.out}")
     return 0

@@ -86,8 +86,16 @@ class Criterion:
 
     def errors(self, pattern: Array) -> dict[str, float]:
         """Root-mean-square posterior sd of each map, and the criterion."""
-        covariance = self._solve(pattern)[0]
-        sd = np.sqrt(self._mse(covariance))
+        return self.errors_of(self.prior + self.information(pattern))
+
+    def information(self, pattern: Array) -> Array:
+        """What a photo under a pattern tells, Jᵀ N⁻¹ J (groups, unknowns, unknowns)."""
+        _, j, jn = self._solve(pattern)[:3]
+        return np.asarray(np.swapaxes(j, 1, 2) @ jn)
+
+    def errors_of(self, precision: Array) -> dict[str, float]:
+        """The same as `errors`, of a posterior precision."""
+        sd = np.sqrt(self._mse(np.linalg.inv(precision)))
         out = dict(zip(NAMES, sd.tolist(), strict=True))
         out["criterion"] = float(np.dot(MAP_WEIGHTS, sd / np.sqrt(self.prior_mse)))
         return out
