@@ -159,7 +159,7 @@ def _write_set(args: argparse.Namespace, console: Console) -> int:
     from invrender.files.output import check_output
     from invrender.files.rig_toml import read_rig
     from invrender.files.write import atomic_path, write_png
-    from invrender.pattern.display import set_page
+    from invrender.pattern.display import pattern_page
     from invrender.pattern.sets import pattern_set
     from invrender.pattern.tablets import find_tablet, tablet_rig
     from invrender.rig import Rig
@@ -175,7 +175,7 @@ def _write_set(args: argparse.Namespace, console: Console) -> int:
         tablet, _ = find_tablet(args.device)
         rig, ppi = tablet_rig(tablet), tablet.ppi
     check_output(args.out, [args.rig] if args.rig else [])
-    page = set_page(patterns, max(rig.screen_sides), ppi)
+    page = pattern_page(patterns[0], rig.screen_sides, ppi, rest=patterns[1:])
     args.out.mkdir(parents=True, exist_ok=True)
     for i, pattern in enumerate(patterns, 1):
         write_png(args.out / f"pattern_{i}.png", pattern)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import io
+from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 
@@ -50,20 +51,24 @@ def write_display_png(path: Path, pattern: Array, size: Size, ppi: float) -> Non
         image.save(temporary, format="PNG", dpi=(ppi, ppi))
 
 
-def pattern_page(pattern: Array, size: Size, ppi: float | None = None, script: str = "") -> str:
+def pattern_page(
+    pattern: Array,
+    size: Size,
+    ppi: float | None = None,
+    script: str = "",
+    rest: Sequence[Array] = (),
+) -> str:
     """An HTML page that shows the pattern (h, w, 3), mirrored, ``size`` metres large.
 
     It is one file and loads nothing: its content security policy allows the image inside it and
     its one script, by that script's hash. Without ``ppi``, the display's pixels an inch, its user
     names the tablet or finds the scale with a bank card. ``script``: the address of one more
     script, for a page that a server of its own keeps in step: it may ask that server, and nobody
-    else.
+    else. rest: more patterns of a set, which taps show one after another.
     """
     wide, deep = _sides(size)
     if ppi is not None:
         device_pixels(wide, ppi), device_pixels(deep, ppi)
-    out = io.BytesIO()
-    encoded(pattern, PAGE_PIXELS).save(out, "PNG")
     own = _data("page.js")
     digest = base64.b64encode(hashlib.sha256(own.encode()).digest()).decode()
     page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(
@@ -74,12 +79,19 @@ def pattern_page(pattern: Array, size: Size, ppi: float | None = None, script: s
         script=own,
         more=script,
         script_hash=f"sha256-{digest}",
-        uri="data:image/png;base64," + base64.b64encode(out.getvalue()).decode(),
+        uri=_uri(pattern),
+        rest=[_uri(p) for p in rest],
         mm=1000 * wide,
         deep=1000 * deep,
         ppi=ppi,
         tablets=TABLETS,
     )
+
+
+def _uri(pattern: Array) -> str:
+    out = io.BytesIO()
+    encoded(pattern, PAGE_PIXELS).save(out, "PNG")
+    return "data:image/png;base64," + base64.b64encode(out.getvalue()).decode()
 
 
 def _sides(size: Size) -> tuple[float, float]:

@@ -126,6 +126,8 @@ async function show() {
 
 function hide() {
   body.classList.remove("shown");
+  step = 0;
+  at("pattern").src = shown[0];
   if (document.fullscreenElement) document.exitFullscreen();
   if (state.awake) state.awake.release();
   state.awake = null;
@@ -149,7 +151,14 @@ at("fill").addEventListener("click", () => {
 at("tablet").addEventListener("change", (e) => { if (e.target.value) setPpi(parseFloat(e.target.value)); });
 for (const id of ["ppi", "side", "deep", "scale"]) at(id).addEventListener("change", layout);
 at("show").addEventListener("click", show);
-at("pattern").addEventListener("click", hide);
+// Of a set, a tap shows the next pattern; after the last, the page.
+const shown = [at("pattern"), ...document.querySelectorAll("img.next")].map((image) => image.src);
+let step = 0;
+function next() {
+  step = (step + 1) % shown.length;
+  if (step) at("pattern").src = shown[step]; else hide();
+}
+at("pattern").addEventListener("click", next);
 body.addEventListener("click", (e) => { if (e.target === body) hide(); });
 document.addEventListener("contextmenu", (e) => e.preventDefault());
 document.addEventListener("keydown", (e) => { if (e.key === "Escape") hide(); });
