@@ -347,11 +347,8 @@ def estimate_maps(
         elif measured:
             if init != "flat":
                 prior = likeliest(photos, [*priors, pooled(priors)], samples)
-            known = share(photos, prior, samples=samples)
-            photos = known.observations
             told = stage.part("refine")
-            result = explain_together(photos, known.prior, samples=samples, progress=told)
-            result.factors = known.factors
+            result = explain_together(photos, prior, samples=samples, progress=told)
         elif init == "flat":
             result = refine(
                 photos, prior, samples=samples,
