@@ -24,8 +24,8 @@ from invrender.rig import Rig
 from invrender.types import Array, InputError
 
 GREATEST_MISFIT = 0.05  # of the square's side by which corners may miss those of any camera
-FARTHEST = 1.0  # of the sample's size that the camera may stand off
-STEEPEST = 60.0  # degrees that it may be tilted
+FARTHEST_CAMERA = 1.0  # of the sample's size that the camera may stand off
+STEEPEST_CAMERA = 60.0  # degrees that it may be tilted
 TOO_LOW = 0.1  # of the screen's height, below which no camera is looked for
 INSIDE = 0.99  # of the bounds, where the search may start
 
@@ -96,9 +96,9 @@ def camera_of_corners(rig: Rig, corners: Array, height: int, width: int) -> Rig:
 
     def misfit(x: Array) -> Array:
         seen = posed(x).project(rig.sample_corners, height, width)
-        return np.nan_to_num((seen - corners) / side, nan=FARTHEST).ravel()
+        return np.nan_to_num((seen - corners) / side, nan=FARTHEST_CAMERA).ravel()
 
-    reach = np.array([FARTHEST] * 3 + [math.radians(STEEPEST)] * 3)
+    reach = np.array([FARTHEST_CAMERA] * 3 + [math.radians(STEEPEST_CAMERA)] * 3)
     low = -reach
     low[2] = max(low[2], (TOO_LOW - 1) * rig.screen_height / rig.sample_size)
     start = np.clip([*rig.camera_shift, *rig.camera_tilt] / scale, low * INSIDE, reach * INSIDE)

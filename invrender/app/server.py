@@ -502,7 +502,7 @@ async def get_file(request: Request) -> Response:
     folder = store.folder_of(app.root, request.path_params["id"])
     name, number = request.path_params["file"], request.path_params.get("number")
     if number is not None:
-        if name not in store.SHOWN:
+        if name not in store.PHOTO_FILES:
             raise KeyError(name)
         file = folder / "shown" / str(number) / name
     else:

@@ -29,7 +29,7 @@ ID = re.compile(r"\d{8}-\d{6}-[0-9a-f]{6}")
 LONGEST_NOTES = 10_000  # characters
 MOST_TAGS = 30
 LONGEST_TAG = 40  # characters
-SHOWN = ("photo.jpg", "clipped.png", "check.json")
+PHOTO_FILES = ("photo.jpg", "clipped.png", "check.json")
 
 
 def prepare(root: Path) -> None:

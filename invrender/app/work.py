@@ -31,12 +31,12 @@ from invrender.types import Array, InputError
 
 Tell = Callable[[Any], None]
 
-SHOWN = 1600  # pixels, the longer side of the photo on the page
+PHOTO_PIXELS = 1600  # pixels, the longer side of the photo on the page
 QUICK = 800  # pixels, of the copy in which ball and sample are looked for first
 PREVIEW = 64  # pixels a side of the first, quick maps
 THUMBNAIL = 320  # pixels a side
 TILED = 512  # pixels a side of the previews of a tile and of the relief
-WHITE = 99.0  # percentile of the photo that is drawn white
+WHITE_PERCENTILE = 99.0  # percentile of the photo that is drawn white
 # The lamp of the thumbnail in sample sizes, its power, and the light from everywhere; by eye.
 LAMP, LAMP_POWER, AMBIENT = (-0.6, 0.6, 1.2), 1.6, 0.35
 # Share of the whole time at which a stage begins; medians of the bundled capture.
@@ -145,9 +145,9 @@ def _plain(lines: dict[str, Array]) -> dict[str, list[list[float]]]:
 
 def _show(photo: Photo, out: Path) -> dict[str, Any]:
     """Write the photo as the page shows it, and where it is saturated; returns its size."""
-    step = max(1, -(-max(photo.height, photo.width) // SHOWN))
-    small = photo.image[::step, ::step] if step > 2 else block_means(photo.image, SHOWN)
-    white = max(float(np.percentile(small, WHITE)), 1e-9)
+    step = max(1, -(-max(photo.height, photo.width) // PHOTO_PIXELS))
+    small = photo.image[::step, ::step] if step > 2 else block_means(photo.image, PHOTO_PIXELS)
+    white = max(float(np.percentile(small, WHITE_PERCENTILE)), 1e-9)
     with atomic_path(out / "photo.jpg") as path:
         Image.fromarray(to_bytes(linear_to_srgb(small / white))).save(path, "JPEG", quality=88)
     clipped = photo.clipped
@@ -206,7 +206,7 @@ def _preview(maps: Maps, rendering: Array | None, place: Path) -> None:
     out.mkdir(exist_ok=True)
     images = {k: _display(k, v) for k, v in maps.encoded().items()}
     if rendering is not None:
-        white = max(float(np.percentile(rendering, WHITE)), 1e-12)
+        white = max(float(np.percentile(rendering, WHITE_PERCENTILE)), 1e-12)
         images["render"] = linear_to_srgb(rendering / white)
         images["lit"] = linear_to_srgb(_lit(maps))
     for name, image in images.items():
