@@ -8,10 +8,10 @@ import numpy as np
 from invrender.pattern.default import default_pattern
 from invrender.types import Array, InputError
 
-DARKEST = 0.02  # of a display's white, with the room's light on its glass
+SET_DARKEST = 0.02  # of a display's white, with the room's light on its glass
 # Of each set, as `invrender.pattern.design.sets.best_set` finds it for the default rig: a shape and
 # a direction, in degrees counter-clockwise from +x.
-PATTERNS: tuple[tuple[str, float], ...] = (
+SET_PATTERNS: tuple[tuple[str, float], ...] = (
     ("default", 0), ("default", 180), ("stripes", 0), ("half", 180), ("half", 90),
     ("half", 270), ("default", 90), ("default", 270),
 )  # fmt: skip
@@ -25,7 +25,7 @@ def pattern_set(count: int, size: int = 256) -> list[Array]:
     """
     if count not in COUNTS:
         raise InputError(f"sets have {', '.join(map(str, COUNTS))} patterns, not {count}")
-    return [_pattern(shape, angle, size) for shape, angle in PATTERNS[:count]]
+    return [_pattern(shape, angle, size) for shape, angle in SET_PATTERNS[:count]]
 
 
 def _pattern(shape: str, angle: float, size: int) -> Array:
@@ -58,5 +58,5 @@ def _along(size: int, angle: float) -> Array:
 
 
 def _grey(value: Array) -> Array:
-    out = DARKEST + (1 - DARKEST) * value[..., None]
+    out = SET_DARKEST + (1 - SET_DARKEST) * value[..., None]
     return np.repeat(out, 3, -1).astype(np.float32)

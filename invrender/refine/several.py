@@ -34,9 +34,9 @@ from invrender.sampling import resize, resize_pattern
 from invrender.types import Array
 
 CLEARLY = 0.9  # how much nearer the turned maps must be
-PATTERN_CELLS = 16  # a side, by which patterns are compared
+COMPARED_CELLS = 16  # a side, by which patterns are compared
 MOST = 1e12  # mean squared residual over its variance, so that its square is finite
-BRIGHTEST = 1.15  # k_d, as it is solved for
+FREE_DIFFUSE = 1.15  # k_d, as it is solved for
 CHI_SQUARED_QUARTILE = 1.213  # the lower one, of three degrees of freedom
 
 
@@ -80,7 +80,7 @@ class Settings:
     lights_error: float = 0.03  # relative, of all albedos: what the lights' scale may be off by
 
 
-SETTINGS = Settings()
+TOGETHER = Settings()
 
 
 @dataclass
@@ -106,8 +106,8 @@ def find_turn(maps: Maps, first: Maps) -> int:
 def by_pattern(patterns: Sequence[Array], known: Array) -> list[int]:
     """Which photos come first, by how like their patterns are to one that the networks know; as
     they stand where that is the same."""
-    known = resize_pattern(known, PATTERN_CELLS)
-    unlike = [float(np.abs(resize_pattern(p, PATTERN_CELLS) - known).mean()) for p in patterns]
+    known = resize_pattern(known, COMPARED_CELLS)
+    unlike = [float(np.abs(resize_pattern(p, COMPARED_CELLS) - known).mean()) for p in patterns]
     return sorted(range(len(patterns)), key=lambda i: round(unlike[i], 2))
 
 
@@ -115,7 +115,7 @@ def likeliest(
     observations: Sequence[Observation],
     priors: Sequence[Prior],
     samples: int,
-    s: Settings = SETTINGS,
+    s: Settings = TOGETHER,
 ) -> Prior:
     """The prior whose slopes and roughness leave the least of all photos, albedos being free."""
     if len(priors) == 1:
@@ -135,7 +135,7 @@ def explain_together(
     *,
     samples: int = 64,
     progress: Callable[[float], None] = lambda share: None,
-    s: Settings = SETTINGS,
+    s: Settings = TOGETHER,
 ) -> RefinedTogether:
     """The mode of the posterior of two photos or more, registered, from a prior's mean.
 
@@ -311,7 +311,7 @@ class _Problem:
 def _in_range(theta: Array) -> Array:
     """θ within its range, in place; but k_d may be a little above one, since lights may be told too
     dark, and nothing else should make up for that."""
-    diffuse = np.clip(theta[..., D], 0, BRIGHTEST)
+    diffuse = np.clip(theta[..., D], 0, FREE_DIFFUSE)
     project(theta)
     theta[..., D] = diffuse
     return theta

@@ -20,7 +20,7 @@ from scipy.spatial.distance import cdist
 from invrender.refine.theta import D, R, S
 from invrender.types import Array
 
-ROUGHNESS = np.array([0.12, 0.22, 0.33, 0.45, 0.57, 0.69, 0.8, 0.92], np.float32)  # by hand
+TRIED_ROUGHNESS = np.array([0.12, 0.22, 0.33, 0.45, 0.57, 0.69, 0.8, 0.92], np.float32)  # by hand
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Settings:
     roughness_weight: float = 0.5  # of ρ against the roots of the albedos, as pixels are grouped
 
 
-SETTINGS = Settings()
+POOLING = Settings()
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def pool_roughness(
     theta: Array,
     sigma: Array,
     solve: Callable[[float, Array], tuple[Array, Array]],
-    s: Settings = SETTINGS,
+    s: Settings = POOLING,
 ) -> Pooled:
     """The materials of pixels with initial maps θ (H, W, 9) and their roughness.
 
@@ -73,25 +73,25 @@ def pool_roughness(
     nothing. solve: from a roughness and θ to start from to the pixels' best θ with it and -2
     log-likelihoods (H, W).
     """
-    costs: list[Array] = [np.empty(0)] * len(ROUGHNESS)
-    middle = len(ROUGHNESS) // 2
-    for order in (range(middle, len(ROUGHNESS)), range(middle - 1, -1, -1)):
+    costs: list[Array] = [np.empty(0)] * len(TRIED_ROUGHNESS)
+    middle = len(TRIED_ROUGHNESS) // 2
+    for order in (range(middle, len(TRIED_ROUGHNESS)), range(middle - 1, -1, -1)):
         start = theta
         for j in order:
-            start, costs[j] = solve(float(ROUGHNESS[j]), start)
-    cost = np.stack(costs).reshape(len(ROUGHNESS), -1).astype(np.float64)
+            start, costs[j] = solve(float(TRIED_ROUGHNESS[j]), start)
+    cost = np.stack(costs).reshape(len(TRIED_ROUGHNESS), -1).astype(np.float64)
     likelihood = np.exp(-s.temper / 2 * (cost - cost.min(0)))
     features = _features(theta)
     label = _groups(features, s)
     centres, means, spreads = [], [], []
     for k in np.unique(label):
         of = label == k
-        off = (ROUGHNESS - theta[..., R].ravel()[of].mean()) / sigma.ravel()[of].mean()
+        off = (TRIED_ROUGHNESS - theta[..., R].ravel()[of].mean()) / sigma.ravel()[of].mean()
         share = _mixture(likelihood[:, of], np.exp(-0.5 * off**2) + 1e-6, s)
-        mean = float(share @ ROUGHNESS)
+        mean = float(share @ TRIED_ROUGHNESS)
         centres.append(features[of].mean(0))
         means.append(mean)
-        spreads.append(max(float(np.sqrt(share @ (ROUGHNESS - mean) ** 2)), s.least_spread))
+        spreads.append(max(float(np.sqrt(share @ (TRIED_ROUGHNESS - mean) ** 2)), s.least_spread))
     return Pooled(*(np.array(x, np.float32) for x in (centres, means, spreads)))
 
 
@@ -110,7 +110,7 @@ def _mixture(likelihood: Array, prior: Array, s: Settings) -> Array:
 def _features(theta: Array) -> Array:
     """Of pixels (H·W, 7), what materials differ by: roots of albedos, and roughness."""
     parts = [np.sqrt(theta[..., D]), np.sqrt(theta[..., S]), theta[..., R : R + 1]]
-    parts[2] = parts[2] * SETTINGS.roughness_weight
+    parts[2] = parts[2] * POOLING.roughness_weight
     return np.concatenate(parts, -1).reshape(-1, 7).astype(np.float32)
 
 

@@ -19,21 +19,21 @@ from invrender.pattern.design.criterion import Criterion
 from invrender.pattern.sets import gradient, half, stripes
 from invrender.types import Array
 
-DIRECTIONS = 8  # of halves and gradients
-STEPS = 3  # phases of stripes
+CANDIDATE_DIRECTIONS = 8  # of halves and gradients
+PHASES = 3  # phases of stripes
 
 
 def candidates(cells: int, default: Array) -> dict[str, Array]:
     """Patterns (cells, cells, 3) by name: the default one and its turns, halves, gradients and
     stripes in several directions; white is none of them, since no ball shows where it is."""
     out = {f"default {90 * k}": np.ascontiguousarray(np.rot90(default, k)) for k in range(4)}
-    for k in range(DIRECTIONS):
-        angle = 360 * k / DIRECTIONS
+    for k in range(CANDIDATE_DIRECTIONS):
+        angle = 360 * k / CANDIDATE_DIRECTIONS
         out[f"half {angle:g}"] = half(cells, angle)
         out[f"gradient {angle:g}"] = gradient(cells, angle)
     for angle in (0, 90):
-        for step in range(STEPS):
-            out[f"stripes {angle} {step}"] = stripes(cells, angle, step / STEPS)
+        for step in range(PHASES):
+            out[f"stripes {angle} {step}"] = stripes(cells, angle, step / PHASES)
     return out
 
 

@@ -13,7 +13,7 @@ from invrender.pattern.default import default_pattern
 from invrender.refine.gauss_newton import Observation
 from invrender.refine.priors import network_prior
 from invrender.refine.several import by_pattern, explain_together, likeliest
-from invrender.refine.shared_roughness import ROUGHNESS, pool_roughness
+from invrender.refine.shared_roughness import TRIED_ROUGHNESS, pool_roughness
 from invrender.refine.theta import R, to_maps, to_theta
 from invrender.render.fast.estimator import Fast
 from invrender.rig import Rig
@@ -126,7 +126,7 @@ def test_roughness_is_that_of_the_materials_pixels_or_the_prior_s():
     np.testing.assert_allclose(mean, np.broadcast_to(wanted, (16, 16)), atol=0.09)
     assert spread.max() < 0.15
     silent = pool_roughness(theta, sigma, lambda rho, start: (start, np.zeros((16, 16))))
-    assert np.abs(silent.roughness(theta)[0] - 0.5).max() < np.diff(ROUGHNESS).max() / 2
+    assert np.abs(silent.roughness(theta)[0] - 0.5).max() < np.diff(TRIED_ROUGHNESS).max() / 2
 
 
 def test_the_likelier_prior_is_taken(truth, renderers):
