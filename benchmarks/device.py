@@ -40,7 +40,7 @@ from invrender.capture.lights import FoundLights, find_lights
 from invrender.colour import PRIMARIES, linear_to_srgb, srgb_to_linear, to_rec709
 from invrender.data.simulate import SAMPLE_LEVEL, simulate_real
 from invrender.data.simulate_camera import Camera, seen, toned
-from invrender.data.simulate_setup import PHOTOS, draw_setup
+from invrender.data.simulate_setup import PHOTO_KINDS, draw_setup
 from invrender.device import IDEAL, Device
 from invrender.files.capture import Capture, load_capture
 from invrender.files.rig_toml import read_rig
@@ -85,7 +85,7 @@ def make_real(
     folder: Path, k: int, drawn: CaptureSet, size: Size, given: argparse.Namespace
 ) -> str:
     """Simulate the k-th capture where it is not there yet; the kind of its photo."""
-    kind, i = PHOTOS[k % 3], k // 3
+    kind, i = PHOTO_KINDS[k % 3], k // 3
     if not folder.exists():
         maps, room, _ = sample_and_room(i, drawn, size.maps, given.materials, given.envs)
         setup = draw_setup(drawn.first_seed + k, kind, sheet=i % 2 == 1)
@@ -350,7 +350,7 @@ def silent(rows: Sequence[Row]) -> float:
 
 def bars(rows: Sequence[Row], straight: Sequence[Row]) -> list[Bar]:
     found = []
-    for kind in PHOTOS:
+    for kind in PHOTO_KINDS:
         some = [r for r in rows if r["kind"] == kind]
         if not some:
             continue
@@ -372,7 +372,7 @@ def bars(rows: Sequence[Row], straight: Sequence[Row]) -> list[Bar]:
 def captures_table(rows: Sequence[Row]) -> Table:
     """By kind of photo and sheet: how many were read, and their errors."""
     lines: list[list[Any]] = []
-    for kind in PHOTOS:
+    for kind in PHOTO_KINDS:
         for sheet in (False, True):
             some = [r for r in rows if r["kind"] == kind and r["sheet"] == sheet]
             if not some:
@@ -414,7 +414,7 @@ def effects_table(rows: Sequence[Row], costs: dict[str, float]) -> Table:
 def plot(path: Path, rows: Sequence[Row]) -> None:
     """Errors of captures over the ideal device's, sorted, by kind."""
     figure, axis = plt.subplots(figsize=(6, 3.5))
-    for kind in PHOTOS:
+    for kind in PHOTO_KINDS:
         over = sorted(ratios([r for r in rows if r["kind"] == kind]))
         count = sum(r["kind"] == kind for r in rows)
         axis.semilogx(over, (np.arange(len(over)) + 1) / max(count, 1), marker=".", label=kind)

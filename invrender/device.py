@@ -11,7 +11,7 @@ from invrender.types import Array, InputError, Vec3
 
 Mixing = tuple[Vec3, Vec3, Vec3]
 NO_MIXING: Mixing = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-STEEPEST = 8.0  # exponent of the falloff; measured displays have 0.3 to 1.6
+STEEPEST_FALLOFF = 8.0  # exponent of the falloff; measured displays have 0.3 to 1.6
 GAMMAS = 0.1, 10.0  # exponents that a display's curve may have
 
 
@@ -44,8 +44,8 @@ class Device:
                 raise InputError(f"device: {f.name} must be finite")
             if value.shape != {"gamma": (3,), "mixing": (3, 3)}.get(f.name, ()):
                 raise InputError(f"device: {f.name} has the wrong number of values")
-        if not 0 <= self.falloff <= STEEPEST:
-            raise InputError(f"device: falloff must lie between 0 and {STEEPEST:g}")
+        if not 0 <= self.falloff <= STEEPEST_FALLOFF:
+            raise InputError(f"device: falloff must lie between 0 and {STEEPEST_FALLOFF:g}")
         if not all(GAMMAS[0] <= g <= GAMMAS[1] for g in self.gamma):
             raise InputError("device: gamma must lie between {:g} and {:g}".format(*GAMMAS))
         if not 0 <= self.black < 1:

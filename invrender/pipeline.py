@@ -31,7 +31,7 @@ if TYPE_CHECKING:  # Dr.Jit compiles where the refinement is imported
 
 MEGABYTES = 200e-6, 8  # of a result: a pixel, and for the rest
 ASKED = 2  # photos of several whose maps networks estimate
-MEASURED = 3  # photos from which these count for more than what networks know
+MEASURING_PHOTOS = 3  # photos from which these count for more than what networks know
 
 
 class Stages:
@@ -301,7 +301,7 @@ def estimate_maps(
         from invrender.refine.theta import to_maps
 
         photos = [c.observation() for c in crops]
-    several, measured = len(crops) > 1, len(crops) >= MEASURED
+    several, measured = len(crops) > 1, len(crops) >= MEASURING_PHOTOS
     if several or init == "flat":
         with stage("initial maps"):
             flat = [flat_maps(p.photo, p.renderer, samples) for p in photos]

@@ -40,7 +40,7 @@ SCREEN_SIZE = 48
 TEXEL_WIDTH, LEAST_ALPHA_SQUARED = 0.4, 1e-6
 LOWEST_Z = -0.95  # of a direction on Lambert's disc, whose border is -1
 GOLDEN = (5**0.5 - 1) / 2  # steps of an even sequence on the circle
-LEAST_COS = 0.02  # between a ray and the screen's axis: 89 degrees
+LEAST_SCREEN_COS = 0.02  # between a ray and the screen's axis: 89 degrees
 LEAST_N_V = 1e-3  # n·v of a normal that looks away from the camera
 FAR = 1e3  # coordinates that are outside any image
 
@@ -249,7 +249,7 @@ def hit_screen(position: Tensor, direction: Tensor, rig: Tensor) -> Tensor:
     x = torch.cat([position, torch.zeros_like(position[:, :1])], 1)
     m = torch.linalg.cross(e_x, e_y, dim=1)
     m = F.normalize(m, dim=1)
-    cos = (direction * m).sum(1, keepdim=True).clamp(min=LEAST_COS)
+    cos = (direction * m).sum(1, keepdim=True).clamp(min=LEAST_SCREEN_COS)
     r = ((corner - x) * m).sum(1, keepdim=True) / cos
     p = x + r * direction - corner
     s = (p * e_x).sum(1, keepdim=True) / (e_x * e_x).sum(1, keepdim=True)

@@ -5,29 +5,17 @@ from __future__ import annotations
 import io
 from functools import cache
 
-import numpy as np
-
-from invrender.pattern.default import default_pattern
 from invrender.pattern.display import PAGE_PIXELS, encoded
+from invrender.pattern.sets import pattern_set
 from invrender.types import Array
 
-HALVES = {
-    "right": (slice(None), slice(128, None)),
-    "left": (slice(None), slice(None, 128)),
-    "upper": (slice(None, 128), slice(None)),
-    "lower": (slice(128, None), slice(None)),
-}
-PATTERNS = ("default", *HALVES)
+# What the page calls the patterns of the set of five, in its order.
+PATTERN_NAMES = ("default", "turned", "stripes", "left", "upper")
 
 
 def pattern(name: str) -> Array:
-    """The pattern by its name, (256, 256, 3) relative radiance; a half of it white, or the
-    default. Raises `KeyError`."""
-    if name == "default":
-        return default_pattern()
-    image = np.zeros((256, 256, 3), np.float32)
-    image[HALVES[name]] = 1
-    return image
+    """The pattern by its name, (256, 256, 3) relative radiance. Raises `ValueError` for another."""
+    return pattern_set(len(PATTERN_NAMES))[PATTERN_NAMES.index(name)]
 
 
 @cache

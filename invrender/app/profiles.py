@@ -15,7 +15,7 @@ from invrender.types import InputError
 
 LONGEST_NAME = 80  # characters
 MOST_PROFILES = 100
-PHOTO_COUNTS = (1, 5)  # the default pattern alone, or with the four halves
+PHOTO_COUNTS = (1, 5)  # the default pattern alone, or a set
 
 
 @dataclass(frozen=True)

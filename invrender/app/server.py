@@ -128,7 +128,7 @@ class App:
             "links": dict.fromkeys(self.links, True),
             "profiles": [asdict(p) for p in self.profiles()], "sizes": SIZES,
             "tablets": [t._asdict() for t in TABLETS], "shown": self.shown,
-            "patterns": patterns.PATTERNS, "folder": str(self.root),
+            "patterns": patterns.PATTERN_NAMES, "folder": str(self.root),
         }  # fmt: skip
 
     def profiles(self) -> list[Profile]:
@@ -351,7 +351,7 @@ async def post_capture(request: Request) -> Response:
         file = query.get("file", "")
         suffix = store.photo_suffix(file)
         pattern = query.get("pattern", app.shown["pattern"])
-        if pattern not in patterns.PATTERNS:
+        if pattern not in patterns.PATTERN_NAMES:
             raise InputError("no such pattern")
         into = query.get("capture")
         folder = store.folder_of(app.root, into) if into else None
@@ -542,7 +542,7 @@ async def post_shown(request: Request) -> Response:
     """Choose what the tablet shows."""
     app, values = _app(request), await _json(request)
     pattern = values.get("pattern", "default") if isinstance(values, dict) else ""
-    if pattern not in patterns.PATTERNS:
+    if pattern not in patterns.PATTERN_NAMES:
         raise InputError("no such pattern")
     app.shown = {"pattern": pattern, "profile": app.profile(str(values.get("profile", ""))).id}
     app.tell("shown", app.shown)

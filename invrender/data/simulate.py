@@ -27,7 +27,7 @@ from invrender.types import Array, InputError
 SHEET_PIXELS = 4000.0  # a metre of the printed sheet
 # Linear values that the photo's parts have when it is exposed for them.
 SAMPLE_LEVEL, SCREEN_LEVEL = 0.75, 0.9
-BRIGHTEST = 99.0, 99.8  # percentiles of sample and ball that these values are for
+BRIGHTEST_PERCENTILES = 99.0, 99.8  # percentiles of sample and ball that these values are for
 
 
 def simulate(
@@ -158,7 +158,7 @@ def _exposure(light: Array, rig: Rig, for_what: str) -> float:
     low, high = (
         level / max(float(np.percentile(part, share)), 1e-9)
         for part, level, share in zip(
-            (sample, ball), (SAMPLE_LEVEL, SCREEN_LEVEL), BRIGHTEST, strict=True
+            (sample, ball), (SAMPLE_LEVEL, SCREEN_LEVEL), BRIGHTEST_PERCENTILES, strict=True
         )
     )
     return {"sample": low, "screen": high, "middle": math.sqrt(low * high)}[for_what]

@@ -17,7 +17,7 @@ from invrender.device import IDEAL, Device
 from invrender.rig import Rig
 from invrender.types import Array, InputError, Vec3
 
-PHOTOS = ("raw", "bracket", "jpeg")
+PHOTO_KINDS = ("raw", "bracket", "jpeg")
 
 
 @dataclass(frozen=True)
@@ -71,9 +71,9 @@ RANGES = {
 }
 # Lit areas of tablets, metres, by pixels and pixels per inch: 10.9", 11" (4:3 and 16:10), 12.9",
 # 13" (3:2).
-TABLETS = ((0.2271, 0.1578), (0.2298, 0.1605), (0.2373, 0.1483), (0.2629, 0.1970),
+TABLET_SIDES = ((0.2271, 0.1578), (0.2298, 0.1605), (0.2373, 0.1483), (0.2629, 0.1970),
            (0.2740, 0.1827))  # fmt: skip
-MARGIN = 0.9  # of the photo's half width, that sample and ball reach
+PHOTO_MARGIN = 0.9  # of the photo's half width, that sample and ball reach
 CLEARANCE = 0.006  # metres by which a display stays out of the camera's view before a hand moves it
 FOCUS = 0.15  # metres; main cameras of phones focus no nearer
 ON_ITS_MARK = 0.25  # of the ball's displacement, where the sheet shows its place
@@ -214,7 +214,7 @@ def _device(draw: _Draw) -> Device:
 def _geometry(draw: _Draw, sphere: bool | None, camera_height: float | None) -> Rig:
     """The rig before a hand moves it: the camera so high and so far beside that its lens sees
     sample and ball, and the display hides neither."""
-    long, short = TABLETS[int(draw.share("tablet") * len(TABLETS))]
+    long, short = TABLET_SIDES[int(draw.share("tablet") * len(TABLET_SIDES))]
     size = (long, short) if draw.share("landscape") < 0.5 else (short, long)
     sphere = draw.share("sphere") < 0.5 if sphere is None else sphere
     reflectance = draw("reflectance") * np.array(draw.rgb("reflectance_rgb"))
@@ -228,7 +228,8 @@ def _geometry(draw: _Draw, sphere: bool | None, camera_height: float | None) -> 
     # The square of a uniform number: half of all lenses are wider than 34 mm.
     focal = low * (high / low) ** (draw.share("focal") ** 2)
     for _ in range(200):
-        reach = (rig.optical_axis_x + rig.sample_size / 2) / MARGIN  # half of what the photo shows
+        # half of what the photo shows
+        reach = (rig.optical_axis_x + rig.sample_size / 2) / PHOTO_MARGIN
         if camera_height is None:
             height = max(reach * focal / HALF_WIDTH, FOCUS)
         else:

@@ -18,7 +18,7 @@ from scipy import fft
 from invrender.types import Array
 
 STEEPEST = 10.0  # slope, 84°: what normals nearer to the horizon are taken for
-STEPS = 12  # more change the height by less than a hundredth of its error
+HEIGHT_STEPS = 12  # more change the height by less than a hundredth of its error
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ def _least_absolute(h: Array, gx: Array, gy: Array, solve: _Poisson) -> Array:
     if not spread.size or spread.max() < 1e-6:
         return h
     threshold = np.float32(max(np.quantile(spread, 0.9), 1e-5))
-    for _ in range(STEPS):
+    for _ in range(HEIGHT_STEPS):
         e = []
         for d, x, v in zip(solve.gradient(h), g, u, strict=True):
             gap = d - x + v

@@ -13,7 +13,7 @@ from invrender.types import Array
 
 AZIMUTHS = 8
 GROWTH = 1.5  # between the distances at which the horizon is looked for, from one pixel on
-FARTHEST = 0.125  # of the shorter side
+FARTHEST_OCCLUDER = 0.125  # of the shorter side
 
 
 def ambient_occlusion(height: Array, pixel: float) -> Array:
@@ -22,7 +22,7 @@ def ambient_occlusion(height: Array, pixel: float) -> Array:
     Heights go on beyond the border as they are at it.
     """
     rows, columns = height.shape
-    reach = max(1, int(FARTHEST * min(rows, columns)))
+    reach = max(1, int(FARTHEST_OCCLUDER * min(rows, columns)))
     padded = np.pad(np.asarray(height, np.float32) / np.float32(pixel), reach, mode="edge")
     here = padded[reach : reach + rows, reach : reach + columns]
     distances = [1.0]

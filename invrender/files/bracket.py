@@ -55,7 +55,7 @@ class BracketSettings:
     unsteady: float = 0.12  # median deviation of the logarithms from which the light changed
 
 
-SETTINGS = BracketSettings()
+BRACKET = BracketSettings()
 
 
 def merge_bracket(photos: Sequence[Photo], names: Sequence[str]) -> Photo:
@@ -83,13 +83,13 @@ def merge_bracket(photos: Sequence[Photo], names: Sequence[str]) -> Photo:
     _check_sharpness(images, usable, names)
     exposures = [p.exposure for p in photos] if known else None
     curve, logs, off = _tone_curve(images, usable, exposures)
-    if logs[-1] - logs[0] < SETTINGS.same_exposure:
+    if logs[-1] - logs[0] < BRACKET.same_exposure:
         raise InputError(
             f"{', '.join(names)} have the same exposure: a bracket needs another one, twice as "
             "long or more"
         )
     merged = _merge(images, curve, logs)
-    top = float(np.exp(np.interp(0.0, np.log(SETTINGS.knots), curve)))
+    top = float(np.exp(np.interp(0.0, np.log(BRACKET.knots), curve)))
     shares = ", ".join(f"{math.exp(x):.3g}" for x in logs)
     note = Notice("photo-bracket", f"{', '.join(names)} were merged; their exposures are {shares}")
     warnings = {w.code: w for p in photos for w in p.warnings}
@@ -99,7 +99,7 @@ def merge_bracket(photos: Sequence[Photo], names: Sequence[str]) -> Photo:
             "is a guess, and with it the screen's light: keep the EXIF of the photos"
         )
         warnings["bracket-unknown"] = Notice("bracket-unknown", text)
-    if off > SETTINGS.unsteady:
+    if off > BRACKET.unsteady:
         text = (
             f"the exposures {', '.join(names)} differ by more than their exposure (a lamp that "
             "flickers, or something that moved): take them again in steady light"
@@ -114,7 +114,7 @@ def merge_bracket(photos: Sequence[Photo], names: Sequence[str]) -> Photo:
 
 def _usable(image: Array) -> Mask:
     """(H, W): pixels that are neither saturated nor dark in any channel."""
-    low, high = SETTINGS.usable
+    low, high = BRACKET.usable
     return np.asarray((image.min(-1) > low) & (image.max(-1) < high))
 
 
@@ -127,26 +127,26 @@ def _ranks(image: Array) -> Array:
 def _aligned(image: Array, reference: Array, name: str, first: str) -> Array:
     """The image laid over the reference; what lies outside it is NaN."""
     h, w = image.shape[:2]
-    scale = min(1.0, SETTINGS.aligned_pixels / max(h, w))
+    scale = min(1.0, BRACKET.aligned_pixels / max(h, w))
     size = round(w * scale), round(h * scale)
     small: list[Array] = [
         np.asarray(cv2.resize(a, size, interpolation=cv2.INTER_AREA), np.float32)
         for a in (reference, image)
     ]
-    mask = (np.minimum(*(a.max(-1) for a in small)) > SETTINGS.usable[0]).astype(np.uint8)
+    mask = (np.minimum(*(a.max(-1) for a in small)) > BRACKET.usable[0]).astype(np.uint8)
     # What is saturated in the longer exposure has no detail there.
-    mask &= (small[1].min(-1) < SETTINGS.usable[1]).astype(np.uint8)
+    mask &= (small[1].min(-1) < BRACKET.usable[1]).astype(np.uint8)
     start = np.eye(3, dtype=np.float32)
     moved: Any = start
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, *SETTINGS.steps)
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, *BRACKET.steps)
     try:
         found, moved = cv2.findTransformECC(
             _ranks(small[0]), _ranks(small[1]), start, cv2.MOTION_HOMOGRAPHY, criteria, mask,
-            SETTINGS.smoothing,
+            BRACKET.smoothing,
         )  # fmt: skip
     except cv2.error:
         found = 0.0
-    if found < SETTINGS.same_scene:
+    if found < BRACKET.same_scene:
         raise InputError(
             f"{name} does not show what {first} shows: a bracket is the same set-up, exposed "
             "longer and shorter, from the same place"
@@ -166,14 +166,14 @@ def _check_sharpness(images: Sequence[Array], usable: Sequence[Mask], names: Seq
     """Raise `InputError` for a photo with much less fine detail than another one."""
     detail = []
     common = np.logical_and.reduce(usable)
-    if common.sum() < SETTINGS.least_common:
+    if common.sum() < BRACKET.least_common:
         return
     for image in images:
-        log = np.log(np.maximum(np.nan_to_num(image.mean(-1)), SETTINGS.usable[0]))
-        band = [ndimage.gaussian_filter(log, s) for s in SETTINGS.fine]
+        log = np.log(np.maximum(np.nan_to_num(image.mean(-1)), BRACKET.usable[0]))
+        band = [ndimage.gaussian_filter(log, s) for s in BRACKET.fine]
         detail.append(float(np.median(np.abs(band[0] - band[1])[common])))
     for name, share in zip(names, np.array(detail) / max(detail), strict=True):
-        if share < SETTINGS.blurred:
+        if share < BRACKET.blurred:
             raise InputError(f"{name} is blurred: take it again, or leave it out")
 
 
@@ -182,17 +182,17 @@ def _tone_curve(
 ) -> tuple[Array, Array, float]:
     """Logarithms of light over value at the knots; of the exposures over the first one; and the
     median deviation that is left."""
-    knots = np.log(SETTINGS.knots)
+    knots = np.log(BRACKET.knots)
     count, n = len(knots), len(images)
     pairs = []
     for k in range(1, n):
         both = usable[k] & usable[k - 1]
-        if both.sum() < SETTINGS.least_common:
+        if both.sum() < BRACKET.least_common:
             raise InputError(
                 "two exposures of the bracket have too little in common: nothing is well exposed "
                 "in both; take one in between"
             )
-        step = max(1, int(both.sum()) // SETTINGS.samples)
+        step = max(1, int(both.sum()) // BRACKET.samples)
         shorter, longer = (
             np.log(images[i][both][::step]).ravel().astype(float) for i in (k - 1, k)
         )
@@ -203,15 +203,15 @@ def _tone_curve(
 
     first = np.diff(np.eye(count), axis=0) / np.diff(knots)[:, None]
     smooth = [
-        first / SETTINGS.slope_deviation[exposures is None],
-        np.diff(first, axis=0) / SETTINGS.bend_deviation,
+        first / BRACKET.slope_deviation[exposures is None],
+        np.diff(first, axis=0) / BRACKET.bend_deviation,
     ]
     rows = [np.pad(np.concatenate(smooth), ((0, 0), (0, n)))]
     right = [np.zeros(len(rows[0]))]
-    known = SETTINGS.exif_error if exposures else SETTINGS.unknown_exposure
+    known = BRACKET.exif_error if exposures else BRACKET.unknown_exposure
     for place, deviation, value in [
-        (SETTINGS.fixed, SETTINGS.certain, 0.0),
-        (count, SETTINGS.certain, 0.0),
+        (BRACKET.fixed, BRACKET.certain, 0.0),
+        (count, BRACKET.certain, 0.0),
         *(
             (
                 count + k,
@@ -225,17 +225,17 @@ def _tone_curve(
         right.append(np.array([value / deviation]))
     # Medians by brightness, not pixels: many noisy ones would draw the curve flat.
     for k, shorter, longer in pairs:
-        bins = np.floor((shorter + longer) / (2 * SETTINGS.bin)).astype(int)
+        bins = np.floor((shorter + longer) / (2 * BRACKET.bin)).astype(int)
         for i in np.unique(bins):
             low, high = shorter[bins == i], longer[bins == i]
             ratio = float(np.median(high - low))
             x, y = np.median(low + high) / 2 + np.array([-0.5, 0.5]) * ratio
             # Near the limits of what is used, noise decides what is.
-            near = x < math.log(SETTINGS.usable[0]) + SETTINGS.limit
-            if len(low) < SETTINGS.least_bin or near:
+            near = x < math.log(BRACKET.usable[0]) + BRACKET.limit
+            if len(low) < BRACKET.least_bin or near:
                 continue
             spread = float(np.median(np.abs(high - low - ratio)))
-            deviation = math.hypot(SETTINGS.bin_deviation, SETTINGS.bin_noise * spread)
+            deviation = math.hypot(BRACKET.bin_deviation, BRACKET.bin_noise * spread)
             row = np.append(shares(x) - shares(y), np.zeros(n))
             row[count + k], row[count + k - 1] = 1, -1
             rows.append(row[None] / deviation)
@@ -252,16 +252,16 @@ def _tone_curve(
 
 def _merge(images: Sequence[Array], curve: Array, logs: Array) -> Array:
     """The radiance (H, W, 3), in the first exposure's unit."""
-    low, high = SETTINGS.usable
+    low, high = BRACKET.usable
     total = np.zeros(images[0].shape)
     weights = np.zeros(images[0].shape)
     for k, (image, log) in enumerate(zip(images, logs, strict=True)):
         value = np.maximum(np.nan_to_num(image), 1e-6)
-        light = value * np.exp(np.interp(np.log(value), np.log(SETTINGS.knots), curve) - log)
+        light = value * np.exp(np.interp(np.log(value), np.log(BRACKET.knots), curve) - log)
         full = np.nan_to_num(image, nan=1.0).max(-1)
         # Beside what is saturated, a JPEG's colours and the lens's glow are wrong too.
-        full = ndimage.maximum_filter(full, SETTINGS.beside)[..., None]
-        weight = np.exp(log) * np.clip((high - full) / (high - SETTINGS.fading), 0, 1)
+        full = ndimage.maximum_filter(full, BRACKET.beside)[..., None]
+        weight = np.exp(log) * np.clip((high - full) / (high - BRACKET.fading), 0, 1)
         weight = weight * np.clip(value / low, 1e-3, 1)
         if k == 0:  # where nothing is well exposed the shortest one counts
             weight = np.maximum(weight, 1e-6)

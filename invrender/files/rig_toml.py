@@ -31,7 +31,7 @@ _KEYS: dict[tuple[str, str], str] = {
     ("sample", "size"): "sample_side",
 }
 # Keys of the section [device], by which a display that was measured is told.
-_DEVICE = tuple(f.name for f in fields(Device))
+_DEVICE_FIELDS = tuple(f.name for f in fields(Device))
 # Fields of the rig that are measured in the photo where the file does not state them.
 FOUND_IN_PHOTO = frozenset({"ball_reflectance", "ball_shape"})
 _FILES = {("pattern", "image"), ("sample", "maps")}
@@ -78,7 +78,7 @@ def read_rig(path: Path, *, fov: float | None = None) -> RigFile:
                 if not isinstance(value, str) or not value:
                     raise InputError(f"{path}: [{section}] {key} must be a file name")
                 files[section] = value
-            elif section == "device" and key in _DEVICE:
+            elif section == "device" and key in _DEVICE_FIELDS:
                 device[key] = _device_value(path, key, value)
             elif (section, key) in _KEYS:
                 name, what = _KEYS[section, key], f"[{section}] {key}"
@@ -94,7 +94,7 @@ def read_rig(path: Path, *, fov: float | None = None) -> RigFile:
                     values[name] = _number(path, what, value, name in _VECTORS)
             else:
                 known = sorted(
-                    {k for s, k in [*_KEYS, *_FILES, *(("device", d) for d in _DEVICE)]
+                    {k for s, k in [*_KEYS, *_FILES, *(("device", d) for d in _DEVICE_FIELDS)]
                      if s == section}
                 )  # fmt: skip
                 hint = f"known keys: {', '.join(known)}" if known else "no such section"
@@ -199,7 +199,7 @@ def write_rig(
             or value != getattr(default, name)
         ):
             state(section, key, value)
-    for key in _DEVICE if device else ():
+    for key in _DEVICE_FIELDS if device else ():
         if getattr(device, key) != getattr(IDEAL, key):
             state("device", key, getattr(device, key))
     if pattern:

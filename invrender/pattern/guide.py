@@ -15,7 +15,7 @@ from invrender.types import InputError
 
 MM = 1 / 25.4  # inches
 PAGE = (210.0, 297.0)  # A4, mm
-MARGIN = 15.0
+PAGE_MARGIN = 15.0
 SCALES = (1, 2, 2.5, 5, 10, 20, 50, 100)
 INK, SOFT, SCREEN, BALL = "#1c1d20", "#74767c", "#2f6fb0", "#b04a2f"
 DIAGONAL = math.hypot(36, 24)  # mm, of the 35 mm frame
@@ -38,8 +38,8 @@ def write_guide(path: Path, rig: Rig) -> None:
         except InputError as error:
             figure = Figure(figsize=(PAGE[0] * MM, PAGE[1] * MM))
             page = _axes(figure, 0, 0, 1)
-            page.text(MARGIN, -20, "No capture sheet", size=17, weight="bold", color=INK)
-            page.text(MARGIN, -30, f"{error}.\nMeasure from page 1.", size=8, color=INK)
+            page.text(PAGE_MARGIN, -20, "No capture sheet", size=17, weight="bold", color=INK)
+            page.text(PAGE_MARGIN, -30, f"{error}.\nMeasure from page 1.", size=8, color=INK)
         else:
             x0, y0, x1, y1 = sheet.page
             figure = Figure(figsize=(1000 * (x1 - x0) * MM, 1000 * (y1 - y0) * MM))
@@ -73,13 +73,13 @@ def _guide(figure: Any, rig: Rig) -> None:
     left, right = -0.75 * l - delta, axis + r + 22 * l / 90
     wide, high = right - left + 40, 1.25 * h + l * 1.15
     scale = next(
-        (s for s in SCALES if wide / s < PAGE[0] - 2 * MARGIN and high / s < 205), SCALES[-1]
+        (s for s in SCALES if wide / s < PAGE[0] - 2 * PAGE_MARGIN and high / s < 205), SCALES[-1]
     )
     page = _axes(figure, 0, 0, 1)
-    x0 = MARGIN + (-left + 20) / scale
+    x0 = PAGE_MARGIN + (-left + 20) / scale
     text = page.text
-    text(MARGIN, -20, "Capture guide", size=17, weight="bold", color=INK)
-    text(MARGIN, -26, f"Drawn at 1 : {scale:g}, lengths in millimetres.", size=9, color=SOFT)
+    text(PAGE_MARGIN, -20, "Capture guide", size=17, weight="bold", color=INK)
+    text(PAGE_MARGIN, -26, f"Drawn at 1 : {scale:g}, lengths in millimetres.", size=9, color=SOFT)
 
     # From the side.
     y0 = 38 + h * 1.12 / scale
@@ -142,8 +142,8 @@ def _guide(figure: Any, rig: Rig) -> None:
         "the ball's view.",
         "invrender inspect FOLDER tells whether it was a good one.",
     )):  # fmt: skip
-        text(MARGIN, y - 5.1 * i, f"{i + 1}.", size=8.5, color=SOFT)
-        text(MARGIN + 6, y - 5.1 * i, line, size=8.2, color=INK)
+        text(PAGE_MARGIN, y - 5.1 * i, f"{i + 1}.", size=8.5, color=SOFT)
+        text(PAGE_MARGIN + 6, y - 5.1 * i, line, size=8.2, color=INK)
 
 
 def _sheet(figure: Any, sheet: Sheet) -> None:

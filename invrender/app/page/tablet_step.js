@@ -2,7 +2,7 @@
 import { h, api, attempt } from "./ui.js";
 import { state, chosen } from "./app.js";
 
-export const NAMES = { default: "The coloured pattern", right: "Right half white", left: "Left half white", upper: "Upper half white", lower: "Lower half white" };
+export const NAMES = { default: "The coloured pattern", turned: "The coloured pattern, turned", stripes: "Stripes", left: "Left half white", upper: "Upper half white" };
 
 export const show = (pattern) => api("/api/shown", "POST", { pattern, profile: chosen().id });
 

@@ -11,11 +11,11 @@ from scipy.optimize import minimize
 from invrender.pattern.default import default_pattern
 from invrender.pattern.design.criterion import Criterion
 from invrender.pattern.design.population import PATTERN_CELLS, draw_population, measure_responses
+from invrender.pattern.sets import DARKEST
 from invrender.rig import Rig
 from invrender.sampling import resize_pattern
 from invrender.types import Array
 
-DARKEST = 0.02  # of a display's white, with the room's light on its glass
 DIM, DIM_WEIGHT = 0.35, 10.0  # a channel whose mean is less is penalised: its gain must be read
 SMOOTHNESS = 0.05  # weight of the mean squared second difference between cells
 
