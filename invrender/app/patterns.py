@@ -14,8 +14,8 @@ PATTERN_NAMES = ("default", "turned", "stripes", "left", "upper")
 
 
 def pattern(name: str) -> Array:
-    """The pattern by its name, (256, 256, 3) relative radiance. Raises `ValueError` for another."""
-    return pattern_set(len(PATTERN_NAMES))[PATTERN_NAMES.index(name)]
+    """The pattern by its name, (256, 256, 3) relative radiance. Raises `KeyError`."""
+    return dict(zip(PATTERN_NAMES, pattern_set(len(PATTERN_NAMES)), strict=True))[name]
 
 
 @cache

@@ -8,7 +8,7 @@ import numpy as np
 from invrender.pattern.default import default_pattern
 from invrender.types import Array, InputError
 
-SET_DARKEST = 0.02  # of a display's white, with the room's light on its glass
+DARKEST = 0.02  # of a display's white, with the room's light on its glass
 # Of each set, as `invrender.pattern.design.sets.best_set` finds it for the default rig: a shape and
 # a direction, in degrees counter-clockwise from +x.
 SET_PATTERNS: tuple[tuple[str, float], ...] = (
@@ -58,5 +58,5 @@ def _along(size: int, angle: float) -> Array:
 
 
 def _grey(value: Array) -> Array:
-    out = SET_DARKEST + (1 - SET_DARKEST) * value[..., None]
+    out = DARKEST + (1 - DARKEST) * value[..., None]
     return np.repeat(out, 3, -1).astype(np.float32)

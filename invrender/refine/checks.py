@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from invrender.refine.flat import USUAL_ROUGHNESS, plane_terms
+from invrender.refine.theta import TINY
 from invrender.render.renderer import Renderer
 from invrender.types import Array
 
@@ -16,7 +17,7 @@ def photo_error(picture: Array, photo: Array, clipped: NDArray[np.bool_]) -> flo
     """RMS difference over the photo's mean, where the photo is not saturated."""
     seen = ~clipped if not clipped.all() else np.ones_like(clipped)
     difference = (picture - photo)[seen].astype(np.float64)
-    return float(np.sqrt(np.mean(difference**2)) / max(float(photo[seen].mean()), 1e-12))
+    return float(np.sqrt(np.mean(difference**2)) / max(float(photo[seen].mean()), TINY))
 
 
 def coarse_error(picture: Array, photo: Array, clipped: NDArray[np.bool_]) -> float:
@@ -31,7 +32,7 @@ def coarse_error(picture: Array, photo: Array, clipped: NDArray[np.bool_]) -> fl
         starts = np.unique(np.arange(BLOCKS) * n // BLOCKS)
         difference, size = (np.add.reduceat(x, starts, axis) for x in (difference, size))
     rms = np.sqrt(np.mean((difference / size[..., None]) ** 2))
-    return float(rms / max(float(photo.mean()), 1e-12))
+    return float(rms / max(float(photo.mean()), TINY))
 
 
 SIDE = 128  # pixels a side that the light in an albedo is looked for by
@@ -61,7 +62,7 @@ def baked_light(diffuse: Array, renderer: Renderer, samples: int = 64) -> float:
     for c in (0, 2):
         x, y = (
             np.log(a[..., c] + least) - np.log(a[..., 1] + least)
-            for a, least in ((light, 1e-6 * float(light.mean()) + 1e-12), (albedo, 0.01))
+            for a, least in ((light, 1e-6 * float(light.mean()) + TINY), (albedo, 0.01))
         )
         x, y = x - x.mean(dtype=np.float64), y - y.mean(dtype=np.float64)
         xx, xy = float((x * x).mean()), float((x * y).mean())

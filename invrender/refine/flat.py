@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from invrender.maps import Maps, constant_maps
+from invrender.refine.theta import TINY
 from invrender.render.backend import dr, vector
 from invrender.render.renderer import Renderer
 from invrender.render.scene import make_view
@@ -29,7 +30,7 @@ def diffuse_rest(photo: Array, terms: tuple[Array, Array, Array], k_s: Array) ->
     What a surface mirrors it cannot scatter too: at most 1 - k_s.
     """
     e, b, a = terms
-    rest = (photo - k_s * b - a) * np.pi / np.maximum(e, 1e-12)
+    rest = (photo - k_s * b - a) * np.pi / np.maximum(e, TINY)
     return np.clip(rest, 0, 1 - k_s).astype(np.float32)
 
 

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from invrender.maps import Maps
 from invrender.refine.priors import Prior
-from invrender.refine.theta import N, R, project, to_maps
+from invrender.refine.theta import TINY, N, R, project, to_maps
 from invrender.render.backend import Float, dr, vector
 from invrender.render.renderer import Material, Renderer
 from invrender.render.scene import aligned, make_view
@@ -122,7 +122,7 @@ class Band:
     ) -> None:
         self.observations, self.rows, self.samples = observations, rows, samples
         photos = [s.photo[rows] for s in observations]
-        means = [max(float(s.photo.mean()), 1e-12) for s in observations]
+        means = [max(float(s.photo.mean()), TINY) for s in observations]
         seen = [
             np.ones(p.shape[:2], bool) if s.clipped is None else ~s.clipped[rows]
             for s, p in zip(observations, photos, strict=True)

@@ -24,6 +24,7 @@ from invrender.colour import AXES
 from invrender.maps import Maps
 from invrender.refine.evidence import MaterialEvidence, compress
 from invrender.refine.flat import USUAL_ROUGHNESS, USUAL_SPECULAR, diffuse_rest, plane_terms
+from invrender.refine.theta import TINY
 from invrender.render.renderer import Renderer
 from invrender.sampling import resize
 from invrender.types import Array
@@ -318,7 +319,7 @@ def _plainness(photo: Array, e: Array, b: Array, a: Array, metal: bool) -> float
 
 def _weight(photo: Array, pixels: Array) -> Array:
     """Inverse standard deviation of pixels relative to the photo's mean: shot noise and floor."""
-    level = photo.mean((0, 1)) + 1e-12
+    level = photo.mean((0, 1)) + TINY
     return 1 / np.sqrt(level * (pixels + 0.1 * level))
 
 

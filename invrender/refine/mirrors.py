@@ -17,7 +17,7 @@ from invrender.maps import Maps
 from invrender.refine.gauss_newton import Observation, linearise
 from invrender.refine.priors import Prior, lobe_prior
 from invrender.refine.shared import grid, parts_of
-from invrender.refine.theta import D, R, S, to_maps, to_theta
+from invrender.refine.theta import TINY, D, R, S, to_maps, to_theta
 from invrender.types import Array
 
 
@@ -102,5 +102,5 @@ def _misfits(
             for x in (photo - image, photo)
         )
         square = (rest**2 / np.maximum(fill, 1e-9)).sum() / weight.sum() / 3
-        found.append(float(np.sqrt(square) / max(light.sum() / weight.sum() / 3, 1e-12)))
+        found.append(float(np.sqrt(square) / max(light.sum() / weight.sum() / 3, TINY)))
     return found

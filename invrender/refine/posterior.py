@@ -37,7 +37,7 @@ from scipy.ndimage import gaussian_filter
 
 from invrender.refine.gauss_newton import Observation, Refined, bands, expected_spread
 from invrender.refine.priors import Prior
-from invrender.refine.theta import D, N, S, project, to_maps
+from invrender.refine.theta import TINY, D, N, S, project, to_maps
 from invrender.sampling import resize
 from invrender.types import Array
 
@@ -153,7 +153,7 @@ def explain(
             inverse = np.linalg.inv(spread)
             surprise = np.einsum("hwc,hwcd,hwd->hw", residual, inverse, residual)
             surprise /= residual.shape[-1]
-            trust = np.minimum(1, s.unlikely / np.maximum(surprise, 1e-12))[..., None, None] ** 2
+            trust = np.minimum(1, s.unlikely / np.maximum(surprise, TINY))[..., None, None] ** 2
             gain = s.take[:, None] * trust * (np.swapaxes(ac, -1, -2) @ inverse) * sigma[..., None]
             if readings is not None:
                 # What two materials differ by is no outlier: g takes its whole step, as far as
@@ -163,7 +163,7 @@ def explain(
                 taken = np.clip(share + step, 0, 1) - share
                 change = (ends[1] - ends[0]) * (np.arange(9) < N.start)
                 theta[rows] += taken * change
-                cut = taken / np.where(np.abs(step) > 1e-12, step, 1)
+                cut = taken / np.where(np.abs(step) > TINY, step, 1)
                 gain_all = gain + (change * cut)[..., None] * gain_g[..., None, :]
             else:
                 gain_all = gain

@@ -29,7 +29,7 @@ from invrender.maps import Maps, map_errors, turn_maps
 from invrender.refine.gauss_newton import BAND, Observation, Refined, linearise
 from invrender.refine.priors import Prior
 from invrender.refine.shared_roughness import Pooled, pool_roughness
-from invrender.refine.theta import D, N, R, S, project, to_maps
+from invrender.refine.theta import TINY, D, N, R, S, project, to_maps
 from invrender.sampling import resize, resize_pattern
 from invrender.types import Array
 
@@ -172,7 +172,7 @@ class _Photo:
 
     @classmethod
     def of(cls, observation: Observation) -> _Photo:
-        return cls(observation, max(float(observation.photo.mean()), 1e-12))
+        return cls(observation, max(float(observation.photo.mean()), TINY))
 
     def variance(self, rows: slice, s: Settings) -> Array:
         """Of the noise of the photo's rows (h, W, 3); next to infinite where it is saturated."""
@@ -370,7 +370,7 @@ def _calibrate(
     logs = np.zeros((len(few), 3))
     for i, photo in enumerate(few):
         image, _ = linearise(photo.observation.renderer, point.theta, samples)
-        ratio = np.log(np.maximum(photo.observation.photo, 1e-12) / np.maximum(image, 1e-12))
+        ratio = np.log(np.maximum(photo.observation.photo, TINY) / np.maximum(image, TINY))
         logs[i] = np.median(ratio.reshape(-1, 3), 0)
     logs -= logs.mean(0)
     spread = s.exposure**2

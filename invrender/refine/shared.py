@@ -32,7 +32,7 @@ from scipy.cluster.vq import kmeans2
 
 from invrender.refine.gauss_newton import BAND, Observation, linearise
 from invrender.refine.priors import Prior
-from invrender.refine.theta import D, N, R, S, project
+from invrender.refine.theta import TINY, D, N, R, S, project
 from invrender.types import Array
 
 UNKNOWNS = 7  # of a material: what θ has but slopes
@@ -320,7 +320,7 @@ class _Problem:
             room = linearise(dark, theta, self.samples)[0]
             screen = factors[0] * (image - room)
             room = factors[1] * room
-            brighter = (screen + room) / np.maximum(image, 1e-12 * image.mean() + 1e-30)
+            brighter = (screen + room) / np.maximum(image, TINY * image.mean() + 1e-30)
             jacobian *= brighter[..., None]
             image = screen + room
             for c in range(3):
