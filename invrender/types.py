@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]
 Vec3 = tuple[float, float, float]
+TINY = 1e-12  # keeps a quotient or a logarithm finite; below any radiance or length in use
 
 
 class Notice(NamedTuple):

@@ -35,11 +35,10 @@ from invrender.capture.settings import (
     FIELD_OF_VIEW,
     MIRRORED_TABLE,
     RIM_FIT,
-    TINY,
 )
 from invrender.files.images import Photo
 from invrender.rig import Rig
-from invrender.types import Array, InputError, Mask, Vec3
+from invrender.types import TINY, Array, InputError, Mask, Vec3
 
 __all__ = ["Ball", "find_ball", "make_ball", "mirror_normals", "place_ball"]
 

@@ -13,10 +13,10 @@ import numpy as np
 from scipy import ndimage
 
 from invrender.capture.mirror import ball_centre, horizon_points, outline_points
-from invrender.capture.settings import BALL_VIEW, TINY
+from invrender.capture.settings import BALL_VIEW
 from invrender.files.images import Photo
 from invrender.rig import Rig
-from invrender.types import Array
+from invrender.types import TINY, Array
 
 
 @dataclass(frozen=True)

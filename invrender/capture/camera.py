@@ -20,10 +20,10 @@ from scipy import ndimage
 
 from invrender.capture.ball_image import sample_image
 from invrender.capture.ball_view import View, view_around
-from invrender.capture.settings import RIM_FIT, SQUARE_FIT, TINY
+from invrender.capture.settings import RIM_FIT, SQUARE_FIT
 from invrender.files.images import Photo
 from invrender.rig import Rig
-from invrender.types import Array, InputError
+from invrender.types import TINY, Array, InputError
 
 
 def find_camera(photo: Photo, rig: Rig) -> tuple[Rig, float]:

@@ -13,13 +13,13 @@ from scipy import optimize
 from invrender.capture.ball_image import BallImage
 from invrender.capture.environment import fill_environment, unfold_environment
 from invrender.capture.robust import cauchy_residuals, spread
-from invrender.capture.settings import CLIPPED_LAMPS, TABLE_METER, TINY
+from invrender.capture.settings import CLIPPED_LAMPS, TABLE_METER
 from invrender.capture.table import distant_pairs, lit_table, room_irradiance
 from invrender.colour import AXES
 from invrender.device import Device
 from invrender.files.images import Photo
 from invrender.rig import Rig
-from invrender.types import Array, Mask
+from invrender.types import TINY, Array, Mask
 
 
 def clipped_share(photo: Photo, rig: Rig, image: BallImage, height: int) -> Array:

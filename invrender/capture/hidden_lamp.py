@@ -15,14 +15,14 @@ from scipy import optimize
 from invrender.capture.ball_image import screen_coordinates
 from invrender.capture.mirror import Ball
 from invrender.capture.robust import cauchy_residuals, spread
-from invrender.capture.settings import HIDDEN_LAMP, TABLE_METER, TINY
+from invrender.capture.settings import HIDDEN_LAMP, TABLE_METER
 from invrender.capture.table import distant_pairs, hidden_by_screen, lit_table
 from invrender.colour import AXES
 from invrender.device import Device
 from invrender.files.images import Photo
 from invrender.rig import Rig
 from invrender.sphere import directions, sky_flux
-from invrender.types import Array, Mask
+from invrender.types import TINY, Array, Mask
 
 
 def add_hidden_lamp(

@@ -13,8 +13,8 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from invrender.capture.settings import DAMPED_STEPS, TINY
-from invrender.types import Array
+from invrender.capture.settings import DAMPED_STEPS
+from invrender.types import TINY, Array
 
 State = TypeVar("State")
 

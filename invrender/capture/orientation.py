@@ -17,12 +17,12 @@ from invrender.capture.ball import find_ball
 from invrender.capture.ball_image import unfold_pattern
 from invrender.capture.camera import find_camera
 from invrender.capture.mirror import Ball, make_ball, place_ball
-from invrender.capture.settings import BALL_SHAPE, CROPPING, ORIENTATION, SQUARE_FIT, TINY
+from invrender.capture.settings import BALL_SHAPE, CROPPING, ORIENTATION, SQUARE_FIT
 from invrender.files.capture import Capture
 from invrender.files.images import Photo
 from invrender.rig import BALL_SHAPES, Rig
 from invrender.sampling import resize_pattern
-from invrender.types import Array, InputError, Notice
+from invrender.types import TINY, Array, InputError, Notice
 
 Circle = tuple[float, float, float]
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-TINY = 1e-12  # keeps a quotient or a logarithm finite; below any radiance or length in use
 GAUSSIAN_SPREAD = 1.48  # standard deviation over median absolute deviation, of a Gaussian
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear RGB; Rec. ITU-R BT.709
 JPEG_LUMA = (0.299, 0.587, 0.114)  # of encoded RGB; Rec. ITU-R BT.601, as in JFIF

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from invrender.capture.ball_image import sample_image
 from invrender.capture.mirror import Ball
 from invrender.capture.response import Response
-from invrender.capture.settings import CROPPING, GAUSSIAN_SPREAD, SCREEN_FIT, SHEET_FIT, TINY
+from invrender.capture.settings import CROPPING, GAUSSIAN_SPREAD, SCREEN_FIT, SHEET_FIT
 from invrender.capture.table import room_irradiance
 from invrender.files.capture import Capture
 from invrender.files.images import Photo
@@ -37,7 +37,7 @@ from invrender.sheet import (
     marker_dictionary,
 )
 from invrender.sphere import resample_environment
-from invrender.types import Array, InputError, Mask, Notice
+from invrender.types import TINY, Array, InputError, Mask, Notice
 
 Circle = tuple[float, float, float]
 

@@ -6,9 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from invrender.refine.flat import USUAL_ROUGHNESS, plane_terms
-from invrender.refine.theta import TINY
 from invrender.render.renderer import Renderer
-from invrender.types import Array
+from invrender.types import TINY, Array
 
 BLOCKS = 16  # parts a side, whose means the coarse error compares
 

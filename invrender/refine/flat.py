@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from invrender.maps import Maps, constant_maps
-from invrender.refine.theta import TINY
 from invrender.render.backend import dr, vector
 from invrender.render.renderer import Renderer
 from invrender.render.scene import make_view
-from invrender.types import Array
+from invrender.types import TINY, Array
 
 USUAL_ROUGHNESS, USUAL_SPECULAR = 0.55, 0.04  # medians of common materials
 

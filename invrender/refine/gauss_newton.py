@@ -27,11 +27,11 @@ from numpy.typing import NDArray
 
 from invrender.maps import Maps
 from invrender.refine.priors import Prior
-from invrender.refine.theta import TINY, N, R, project, to_maps
+from invrender.refine.theta import N, R, project, to_maps
 from invrender.render.backend import Float, dr, vector
 from invrender.render.renderer import Material, Renderer
 from invrender.render.scene import aligned, make_view
-from invrender.types import Array
+from invrender.types import TINY, Array
 
 PHOTO_NOISE = (0.02, 0.01)  # relative to the pixel, and to the photo's mean: sensor and model
 TRUST = (0.1, 0.2)  # how far one step may move roughness and slopes

@@ -24,10 +24,9 @@ from invrender.colour import AXES
 from invrender.maps import Maps
 from invrender.refine.evidence import MaterialEvidence, compress
 from invrender.refine.flat import USUAL_ROUGHNESS, USUAL_SPECULAR, diffuse_rest, plane_terms
-from invrender.refine.theta import TINY
 from invrender.render.renderer import Renderer
 from invrender.sampling import resize
-from invrender.types import Array
+from invrender.types import TINY, Array
 
 Labels = NDArray[np.intp]
 ROUGHNESS = np.array([0.05, 0.1, 0.16, 0.23, 0.32, 0.42, 0.55, 0.7, 0.85, 1.0])

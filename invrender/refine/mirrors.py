@@ -17,8 +17,8 @@ from invrender.maps import Maps
 from invrender.refine.gauss_newton import Observation, linearise
 from invrender.refine.priors import Prior, lobe_prior
 from invrender.refine.shared import grid, parts_of
-from invrender.refine.theta import TINY, D, R, S, to_maps, to_theta
-from invrender.types import Array
+from invrender.refine.theta import D, R, S, to_maps, to_theta
+from invrender.types import TINY, Array
 
 
 @dataclass(frozen=True)

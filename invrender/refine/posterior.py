@@ -37,9 +37,9 @@ from scipy.ndimage import gaussian_filter
 
 from invrender.refine.gauss_newton import Observation, Refined, bands, expected_spread
 from invrender.refine.priors import Prior
-from invrender.refine.theta import TINY, D, N, S, project, to_maps
+from invrender.refine.theta import D, N, S, project, to_maps
 from invrender.sampling import resize
-from invrender.types import Array
+from invrender.types import TINY, Array
 
 
 @dataclass(frozen=True)

@@ -29,9 +29,9 @@ from invrender.maps import Maps, map_errors, turn_maps
 from invrender.refine.gauss_newton import BAND, Observation, Refined, linearise
 from invrender.refine.priors import Prior
 from invrender.refine.shared_roughness import Pooled, pool_roughness
-from invrender.refine.theta import TINY, D, N, R, S, project, to_maps
+from invrender.refine.theta import D, N, R, S, project, to_maps
 from invrender.sampling import resize, resize_pattern
-from invrender.types import Array
+from invrender.types import TINY, Array
 
 CLEARLY = 0.9  # how much nearer the turned maps must be
 COMPARED_CELLS = 16  # a side, by which patterns are compared

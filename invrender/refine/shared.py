@@ -32,8 +32,8 @@ from scipy.cluster.vq import kmeans2
 
 from invrender.refine.gauss_newton import BAND, Observation, linearise
 from invrender.refine.priors import Prior
-from invrender.refine.theta import TINY, D, N, R, S, project
-from invrender.types import Array
+from invrender.refine.theta import D, N, R, S, project
+from invrender.types import TINY, Array
 
 UNKNOWNS = 7  # of a material: what θ has but slopes
 KNOWN = (0.0, 0.0)  # doubt of lights that are known

@@ -10,7 +10,6 @@ from invrender.types import Array
 D, S, R, N = slice(0, 3), slice(3, 6), 6, slice(7, 9)  # places of the parameters in θ
 MIN_FITTED_ROUGHNESS = 0.03
 MAX_SLOPE = 3.0  # 72 degrees
-TINY = 1e-12  # in place of a zero that would divide or have a logarithm
 
 
 def to_theta(maps: Maps) -> Array:
