@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from invrender.device import IDEAL, Device
-from invrender.files.bracket import merge_bracket
 from invrender.files.images import PHOTOS, Photo, read_image, read_photo
 from invrender.files.maps import read_maps
 from invrender.files.rig_toml import read_rig
@@ -67,7 +66,11 @@ def load_capture(folder: str | Path) -> Capture:
     photos = [read_photo(path) for path in paths]
     for photo, path in zip(photos, paths, strict=True):
         check_photo(photo, str(path))
-    photo = photos[0] if len(photos) == 1 else merge_bracket(photos, [p.name for p in paths])
+    photo = photos[0]
+    if len(photos) > 1:
+        from invrender.files.bracket import merge_bracket  # OpenCV takes 0.2 s to import
+
+        photo = merge_bracket(photos, [p.name for p in paths])
     given = read_rig(folder / "rig.toml", fov=photo.fov)
     pattern_path = _inside(folder, given.files.get("pattern") or _find_pattern(folder))
     pattern = read_image(pattern_path)
