@@ -179,7 +179,8 @@ def write_shard(folder: Path, index: int, options: Options, count: int = SHARD) 
         return path
     stream = captures(options, index)
     samples = [next(stream) for _ in range(count)]
-    tensors = {k: np.stack([s[k] for s in samples]) for k in samples[0]}
+    # Safetensors writes an array's memory as it lies, whatever its strides (0.8.0).
+    tensors = {k: np.ascontiguousarray([s[k] for s in samples]) for k in samples[0]}
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     save_file(tensors, part, metadata={"options": json.dumps(asdict(options)), "index": str(index)})
     part.replace(path)

@@ -58,6 +58,15 @@ def test_a_shard_holds_captures_in_units_of_white(folder):
     assert 0.01 < shard["photo"].astype(float).mean() < 1
 
 
+def test_a_shard_is_read_as_it_was_made(folder):
+    """Whatever the memory order of the captures' arrays."""
+    made = data.captures(OPTIONS, 0)
+    shard = load_file(shards(folder)[0])
+    for i in range(len(shard["photo"])):
+        for k, v in next(made).items():
+            np.testing.assert_array_equal(shard[k][i], v, err_msg=k)
+
+
 def test_shards_are_reproducible_and_differ(folder, tmp_path):
     again = load_file(data.write_shard(tmp_path, 1, OPTIONS, 6))
     first, second = (load_file(p) for p in shards(folder))
