@@ -34,7 +34,7 @@ from invrender.refine.theta import deviations
 from invrender.render.point_lights import rerender
 from invrender.render.renderer import Renderer
 from invrender.report.notices import POOR_FIT
-from invrender.types import Array
+from invrender.types import Array, InputError
 
 TRUE = "network, true lights"
 INITS = ("network", "flat", TRUE)
@@ -286,17 +286,23 @@ def main(args: argparse.Namespace) -> None:
     real = (None, None) if args.quick else (args.materials, args.envs)
     inits = args.init or INITS
     results: dict[str, dict[str, list[Row]]] = {}
+    refused: dict[str, dict[str, str]] = {}
     bundled = measure(EXAMPLE, size, inits[0])  # the first loads libraries, compiles kernels
     for kind, drawn in SETS.items():
         if kind == "others" and not (args.others or args.quick):
             continue
         folders = make_captures(args.out / FOLDERS[kind], drawn, count, size, width, spp, *real)
-        results[kind] = {}
+        results[kind], refused[kind] = {}, {}
         for init in inits:
             rows = results[kind][init] = []
             for k, folder in enumerate(folders):
-                rows.append(measure(folder, size, init, drawn.noise_of(k)))
-                r = rows[-1]
+                try:
+                    r = measure(folder, size, init, drawn.noise_of(k))
+                except InputError as error:
+                    refused[kind][folder.name] = str(error)
+                    print(f"{kind} {folder.name} is refused: {error}", flush=True)
+                    continue
+                rows.append(r)
                 print(
                     f"{kind} {folder.name}, {init}: maps {r['average_initial']:.4f} →"
                     f" {r['average_refined']:.4f}, photo {r['photo_refined']:.3f}, re-render"
@@ -317,7 +323,8 @@ def main(args: argparse.Namespace) -> None:
     reached = [
         b for kind, s in summaries.items() if "network" in s for b in bars(kind, s["network"])
     ]
-    content: dict[str, Any] = {"summaries": summaries, "rows": results}
+    reached += [bar(f"{k}: captures refused", len(r), 0, False) for k, r in refused.items()]
+    content: dict[str, Any] = {"summaries": summaries, "rows": results, "refused": refused}
     if inits[0] == "network":
         content["bundled"] = bundled
         reached += bundled_bars(bundled)
