@@ -73,9 +73,12 @@ def test_from_the_rig_to_a_file(server, page, tmp_path):
     click("#take")
     click("#to-gltf")
     file = tmp_path / "Example-gltf.glb"
-    end = time.monotonic() + 60
+    again, end = time.monotonic() + 30, time.monotonic() + 90
     while not file.exists() and time.monotonic() < end:
         time.sleep(0.1)
+        if time.monotonic() > again:  # a press on a button that is just drawn anew is lost
+            again = end
+            click("#to-gltf")
     used = server.processor_seconds() - before
     print(f"\n{clicks} clicks, {used:.1f} processor seconds, a second start included")
     assert file.read_bytes()[:4] == b"glTF"
