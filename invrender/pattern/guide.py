@@ -53,8 +53,12 @@ def needed_focal(rig: Rig) -> float:
 
     In millimetres, by CIPA DCG-001 (diagonals); 5% of the photo's half width are kept free.
     """
-    tangent = (rig.optical_axis_x + rig.sample_size / 2) / rig.screen_height
+    tangent = (rig.optical_axis_x + rig.sample_size / 2) / _lens_height(rig)
     return DIAGONAL / 2 * 0.8 / tangent * 0.95
+
+
+def _lens_height(rig: Rig) -> float:
+    return rig.screen_height if rig.camera_height is None else rig.camera_height
 
 
 def _axes(figure: Any, x: float, y: float, scale: float) -> Any:
@@ -68,10 +72,12 @@ def _axes(figure: Any, x: float, y: float, scale: float) -> Any:
 
 
 def _guide(figure: Any, rig: Rig) -> None:
-    l, h, r = 1000 * rig.screen_sides[0], 1000 * rig.screen_height, 1000 * rig.ball_radius
-    delta, axis = 1000 * rig.camera_offset, 1000 * rig.optical_axis_x
-    left, right = -0.75 * l - delta, axis + r + 22 * l / 90
-    wide, high = right - left + 40, 1.25 * h + l * 1.15
+    w, d = (1000 * side for side in rig.screen_sides)
+    h, lens, r = 1000 * rig.screen_height, 1000 * _lens_height(rig), 1000 * rig.ball_radius
+    a, delta, axis = 500 * rig.sample_size, 1000 * rig.camera_offset, 1000 * rig.optical_axis_x
+    edge, top = a - delta, max(h, lens)
+    left, right = edge - w, axis + r + 22 * d / 90
+    wide, high = right - left + 40, 1.25 * top + d * 1.15
     scale = next(
         (s for s in SCALES if wide / s < PAGE[0] - 2 * PAGE_MARGIN and high / s < 205), SCALES[-1]
     )
@@ -82,46 +88,50 @@ def _guide(figure: Any, rig: Rig) -> None:
     text(PAGE_MARGIN, -26, f"Drawn at 1 : {scale:g}, lengths in millimetres.", size=9, color=SOFT)
 
     # From the side.
-    y0 = 38 + h * 1.12 / scale
+    y0 = 38 + top * 1.12 / scale
     side = _axes(figure, x0, y0, scale)
-    side.text(left, h * 1.12, "From the side", size=10, weight="bold", color=INK)
+    side.text(left, top * 1.12, "From the side", size=10, weight="bold", color=INK)
     side.plot([left - 8, right + 8], [0, 0], color=INK, lw=1)
-    side.plot([-l / 4, l / 4], [0, 0], color=INK, lw=4, solid_capstyle="butt")
+    side.plot([-a, a], [0, 0], color=INK, lw=4, solid_capstyle="butt")
     side.text(0, 3 * scale, "sample", ha="center", size=8, color=INK)
-    side.plot([left, l / 4 - delta], [h, h], color=SCREEN, lw=4, solid_capstyle="butt")
+    side.plot([left, edge], [h, h], color=SCREEN, lw=4, solid_capstyle="butt")
     side.text(left, h + 2.5 * scale, "pattern, facing down", size=8, color=SCREEN)  # fmt: skip
     angle = np.linspace(0, math.pi, 60)
     side.fill(axis + r * np.cos(angle), r * np.sin(angle), color=BALL)
     side.text(axis + r + 1.5 * scale, 2 * scale, f"mirror ball\nradius {r:.1f}", size=8,
               color=BALL)  # fmt: skip
-    side.plot([axis, axis], [r, h], color=SOFT, lw=0.7, ls=(0, (5, 4)))
-    side.plot([axis], [h], marker="o", ms=5, color=INK)
-    side.text(axis + 2 * scale, h + 2.5 * scale, "lens, looking straight down", size=8, ha="center",
-              color=INK)  # fmt: skip
-    for x in (-l / 4, l / 4):  # the ways that mirror the screen's edges into the lens
-        side.plot([2 * x - axis, x, axis], [h, 0, h], color=SOFT, lw=0.5)
+    side.plot([axis, axis], [r, lens], color=SOFT, lw=0.7, ls=(0, (5, 4)))
+    side.plot([axis], [lens], marker="o", ms=5, color=INK)
+    side.text(axis + 2 * scale, lens + 2.5 * scale, "lens, looking straight down", size=8,
+              ha="center", color=INK)  # fmt: skip
+    for x in (-a, a):  # the ways on which the sample's edges mirror the screen into the lens
+        side.plot([x - (axis - x) * h / lens, x, axis], [h, 0, lens], color=SOFT, lw=0.5)
     _length(side, (right, 0), (right, h), f"{h:.0f}", scale)
-    _length(side, (l / 4 - delta, h * 0.9), (axis, h * 0.9), f"{2 * delta:.0f}", scale)
+    if lens != h:
+        _length(side, (axis + 4 * scale, 0), (axis + 4 * scale, lens), f"{lens:.0f}", scale)
+    _length(side, (edge, h * 0.9), (axis, h * 0.9), f"{2 * delta:.0f}", scale)
 
     # From above, in the photo's orientation.
-    y1 = y0 + 14 + (l / 2 * 1.12) / scale
+    y1 = y0 + 14 + (d / 2 * 1.12) / scale
     above = _axes(figure, x0, y1, scale)
-    above.text(left, l / 2 + 3 * scale, "From above, as the photo shows it", size=10,
+    above.text(left, d / 2 + 3 * scale, "From above, as the photo shows it", size=10,
                weight="bold", color=INK)  # fmt: skip
-    _rectangle(above, left, -l / 2, l, l, SCREEN, ls="--", lw=1)
-    above.text(left + 2 * scale, -l / 2 + 2 * scale, "pattern (above)", size=8, color=SCREEN)
-    _rectangle(above, -l / 4, -l / 4, l / 2, l / 2, INK, lw=1.4)
+    _rectangle(above, left, -d / 2, w, d, SCREEN, ls="--", lw=1)
+    above.text(left + 2 * scale, -d / 2 + 2 * scale, "pattern (above)", size=8, color=SCREEN)
+    _rectangle(above, -a, -a, 2 * a, 2 * a, INK, lw=1.4)
     above.text(0, 0, "sample", ha="center", va="center", size=8, color=INK)
     turn = np.linspace(0, 2 * math.pi, 90)
     above.fill(axis + r * np.cos(turn), r * np.sin(turn), color=BALL)
     above.text(axis, r + 2 * scale, "ball, below the lens", ha="center", size=8, color=BALL)
-    _length(above, (left, -l / 2 - 5 * scale), (left + l, -l / 2 - 5 * scale), f"{l:.0f}", scale)
-    _length(above, (-l / 4, -l / 4 - 5 * scale), (l / 4, -l / 4 - 5 * scale), f"{l / 2:.0f}", scale)
-    _length(above, (0, -l / 8), (axis, -l / 8), f"{axis:.0f}", scale)
-    above.annotate("photo's top", (right, l / 2), (right, l / 4), ha="center", size=8, color=SOFT,
+    _length(above, (left, -d / 2 - 5 * scale), (edge, -d / 2 - 5 * scale), f"{w:.0f}", scale)
+    if w != d:
+        _length(above, (left - 11 * scale, -d / 2), (left - 11 * scale, d / 2), f"{d:.0f}", scale)
+    _length(above, (-a, -a - 5 * scale), (a, -a - 5 * scale), f"{2 * a:.0f}", scale)
+    _length(above, (0, -a / 2), (axis, -a / 2), f"{axis:.0f}", scale)
+    above.annotate("photo's top", (right, d / 2), (right, d / 4), ha="center", size=8, color=SOFT,
                    arrowprops={"arrowstyle": "->", "color": SOFT})  # fmt: skip
 
-    y = -(y1 + l / 2 / scale + 16)
+    y = -(y1 + d / 2 / scale + 16)
     fov, focal = rig.fov, needed_focal(rig)
     for i, line in enumerate((
         "Page 2 is the capture sheet: its markers tell where the camera was, its white paper how "
@@ -132,8 +142,9 @@ def _guide(figure: Any, rig: Rig) -> None:
         "night light and tone adaptation.",
         f"Hold the display {h:.0f} mm above the table, face down and level, its top edge where the "
         "photo's top is.",
-        f"The lens is beside the pattern, {2 * delta:.0f} mm from its edge, at the same height, "
-        "straight above the ball.",
+        f"The lens is beside the pattern, {2 * delta:.0f} mm from its edge, "
+        + ("at the same height" if lens == h else f"{lens:.0f} mm above the table")
+        + ", straight above the ball.",
         f"Lens of {focal:.0f} mm or less (35 mm equivalent; rig.toml says {fov:.0f}° across); "
         "no zoom, no portrait mode, no filters, no flash.",
         "Focus on the sample and lock it. Expose so that neither the sample nor the pattern in the "

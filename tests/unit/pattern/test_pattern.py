@@ -35,7 +35,7 @@ from invrender.pattern.design import (
 )
 from invrender.pattern.design.population import _shade
 from invrender.pattern.display import pattern_page
-from invrender.pattern.guide import _sheet, needed_focal
+from invrender.pattern.guide import _guide, _sheet, needed_focal
 from invrender.pattern.tablets import TABLETS, find_tablet
 from invrender.rig import Rig
 from invrender.sampling import resize_pattern
@@ -283,6 +283,36 @@ def test_guide_is_two_pages_for_any_rig(tmp_path):
         assert millimetres == [pytest.approx((210, 297), abs=0.1), pytest.approx(size, abs=0.1)]
     # A 24 mm lens has a field of 71.6° across a 4:3 photo; the default sample needs 70° of it.
     assert needed_focal(RIG) == pytest.approx(23.6, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("rig", "lengths"),
+    [
+        (Rig(), {"153", "34", "180", "90", "62"}),
+        (Rig((0.228, 0.16), camera_height=0.2), {"153", "34", "228", "160", "80", "57", "200"}),
+        (Rig(sample_side=0.06), {"153", "34", "180", "60", "47"}),
+    ],
+)
+def test_the_guide_draws_the_rig_as_it_is(rig, lengths):
+    figure = Figure()
+    _guide(figure, rig)
+    _, side, above = figure.axes
+    numbers = {t.get_text() for axes in (side, above) for t in axes.texts}
+    assert {n for n in numbers if n.isdigit()} == lengths
+    drawn = [line.get_xydata() for line in above.lines]
+    (width, depth), half = rig.screen_sides, rig.sample_size / 2
+    for low, high in (
+        ((half - rig.camera_offset - width, -depth / 2), (half - rig.camera_offset, depth / 2)),
+        ((-half, -half), (half, half)),
+    ):
+        assert any(
+            np.allclose(x.min(0), 1000 * np.array(low))
+            and np.allclose(x.max(0), 1000 * np.array(high))
+            for x in drawn
+        )
+    # 17.31 mm are half of the width of 4:3 with the diagonal of 36 × 24, of which 95% are used.
+    reach = rig.optical_axis_x + half
+    assert needed_focal(rig) == pytest.approx(17.31 * 0.95 * rig.camera[2] / reach, rel=1e-3)
 
 
 def test_the_printed_sheet_is_the_one_that_is_looked_for():
