@@ -216,7 +216,7 @@ def _reconstruct(
         coarse = coarse_error(pictures[1], first.photo, first.clipped)
         notices = map_notices(found[0].lights, first.clipped, refined, init, baked, coarse)
         names = [f.capture.name for f in found]
-        left_out = [names[i] for i in getattr(refined, "left_out", [])]
+        left_out = [names[i] for i in refined.left_out]
         notices += [
             Notice(
                 "photo-left-out",
@@ -226,7 +226,7 @@ def _reconstruct(
             for name in left_out
         ]
         used = [name for name in names if name not in left_out]
-        each = dict(zip(used, getattr(refined, "photo_errors", []), strict=False))
+        each = dict(zip(used, refined.photo_errors, strict=False))
     errors, capture = None, found[0].capture
     if capture.truth is not None:
         truth = resize_maps(capture.truth, size, size)

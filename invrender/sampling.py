@@ -42,6 +42,11 @@ def _weights(old: int, new: int) -> csr_array:
     return csr_array((values, column.ravel(), start), shape=(new, old))
 
 
+def centres(n: int, of: int) -> NDArray[np.intp]:
+    """Which of ``of`` pixels hold the centres of n that span the same length."""
+    return ((np.arange(n) + 0.5) / n * of).astype(np.intp)
+
+
 def resize_pattern(
     pattern: NDArray[Any], size: int, width: int | None = None
 ) -> NDArray[np.float32]:
@@ -67,3 +72,16 @@ def _resampling(old: int, new: int) -> NDArray[np.float64]:
     np.add.at(weights, (np.arange(new), left), 1 - (place - left))
     np.add.at(weights, (np.arange(new), right), place - left)
     return weights
+
+
+def knot_shares(x: Array, knots: Array) -> Array:
+    """How much of each knot's value a function that is linear between ``knots`` (k,), and constant
+    beyond, has at x (...): (..., k)."""
+    return np.stack([np.interp(x, knots, row) for row in np.eye(len(knots))], -1)
+
+
+def knot_slopes(knots: Array) -> tuple[Array, Array]:
+    """Rows that make of the values at ``knots`` (k,) the slopes between them, (k - 1, k), and what
+    these change by at each inner knot, (k - 2, k)."""
+    slopes = np.diff(np.eye(len(knots)), axis=0) / np.diff(knots)[:, None]
+    return slopes, np.diff(slopes, axis=0)

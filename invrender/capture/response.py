@@ -8,6 +8,7 @@ import numpy as np
 
 from invrender.capture.settings import TONE_CURVE
 from invrender.files.images import Photo
+from invrender.sampling import knot_shares, knot_slopes
 from invrender.types import Array
 
 
@@ -61,18 +62,17 @@ def curve_shares(light: Array) -> Array:
     """How much of each knot's logarithm the light (...) has, (..., knots)."""
     knots = np.log(TONE_CURVE.knots)
     log = np.log(np.maximum(light, TONE_CURVE.darkest))
-    return np.stack([np.interp(log, knots, row) for row in np.eye(len(knots))], -1)
+    return knot_shares(log, knots)
 
 
 def curve_precision() -> Array:
     """Inverse covariance of the logarithms: small slopes that change little, nought at the fixed
     knot."""
     knots = np.log(TONE_CURVE.knots)
-    first = np.diff(np.eye(len(knots)), axis=0) / np.diff(knots)[:, None]
-    bend = np.diff(first, axis=0)
+    slope, bend = knot_slopes(knots)
     fixed = np.zeros((1, len(knots)))
     fixed[0, TONE_CURVE.fixed] = 1 / TONE_CURVE.fixed_deviation
     rows = np.concatenate(
-        [first / TONE_CURVE.slope_deviation, bend / TONE_CURVE.bend_deviation, fixed]
+        [slope / TONE_CURVE.slope_deviation, bend / TONE_CURVE.bend_deviation, fixed]
     )
     return np.asarray(rows.T @ rows)

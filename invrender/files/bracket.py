@@ -19,6 +19,7 @@ import numpy as np
 from scipy import ndimage
 
 from invrender.files.images import Photo
+from invrender.sampling import knot_shares, knot_slopes
 from invrender.types import Array, InputError, Mask, Notice
 
 
@@ -198,13 +199,10 @@ def _tone_curve(
         )
         pairs.append((k, shorter, longer))
 
-    def shares(log: Array) -> Array:
-        return np.stack([np.interp(log, knots, row) for row in np.eye(count)], -1)
-
-    first = np.diff(np.eye(count), axis=0) / np.diff(knots)[:, None]
+    slope, bend = knot_slopes(knots)
     smooth = [
-        first / BRACKET.slope_deviation[exposures is None],
-        np.diff(first, axis=0) / BRACKET.bend_deviation,
+        slope / BRACKET.slope_deviation[exposures is None],
+        bend / BRACKET.bend_deviation,
     ]
     rows = [np.pad(np.concatenate(smooth), ((0, 0), (0, n)))]
     right = [np.zeros(len(rows[0]))]
@@ -236,7 +234,7 @@ def _tone_curve(
                 continue
             spread = float(np.median(np.abs(high - low - ratio)))
             deviation = math.hypot(BRACKET.bin_deviation, BRACKET.bin_noise * spread)
-            row = np.append(shares(x) - shares(y), np.zeros(n))
+            row = np.append(knot_shares(x, knots) - knot_shares(y, knots), np.zeros(n))
             row[count + k], row[count + k - 1] = 1, -1
             rows.append(row[None] / deviation)
             right.append(np.array([ratio / deviation]))

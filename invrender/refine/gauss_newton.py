@@ -60,7 +60,9 @@ class Refined:
     """Maps, their posterior standard deviations (H, W, 9) in the order of θ, how the fit went.
 
     interrupted: by Ctrl-C; the maps are the best so far. factors: of each photo's screen and room,
-    RGB, by which the lights were found to be off; empty where they were not fitted.
+    RGB, by which the lights were found to be off; empty where they were not fitted. Of several
+    photos that were explained together: left_out, which do not belong to the others; photo_errors,
+    of each that does, the RMS of what the maps leave over its mean.
     """
 
     maps: Maps
@@ -69,6 +71,8 @@ class Refined:
     converged: bool = False
     interrupted: bool = False
     factors: list[tuple[Array, Array]] = field(default_factory=list)
+    left_out: list[int] = field(default_factory=list)
+    photo_errors: list[float] = field(default_factory=list)
 
 
 def linearise(

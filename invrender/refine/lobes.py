@@ -25,7 +25,7 @@ from invrender.maps import Maps
 from invrender.refine.evidence import MaterialEvidence, compress
 from invrender.refine.flat import USUAL_ROUGHNESS, USUAL_SPECULAR, diffuse_rest, plane_terms
 from invrender.render.renderer import Renderer
-from invrender.sampling import resize
+from invrender.sampling import centres, resize
 from invrender.types import TINY, Array
 
 Labels = NDArray[np.intp]
@@ -118,7 +118,7 @@ def read_lobes(
 
 def _small(photo: Array) -> Array:
     """The pixels of a photo that its lobes are fitted to."""
-    rows, columns = (_centres(min(FIT_SIZE, n), n) for n in photo.shape[:2])
+    rows, columns = (centres(min(FIT_SIZE, n), n) for n in photo.shape[:2])
     return photo[np.ix_(rows, columns)]
 
 
@@ -197,11 +197,6 @@ def _terms(renderer: Renderer, height: int, width: int, rho: float, samples: int
     """`plane_terms`, for wide lobes from a coarse grid."""
     h, w = (height, width) if rho < SMOOTH else (min(GRID, height), min(GRID, width))
     return [resize(x, height, width) for x in plane_terms(renderer, h, w, rho, samples)]
-
-
-def _centres(n: int, of: int) -> Labels:
-    """Which of ``of`` pixels hold the centres of n that span the same length."""
-    return ((np.arange(n) + 0.5) / n * of).astype(np.intp)
 
 
 def _closest(photo: Array, terms: list[Any], lobes: list[Lobe]) -> Labels:

@@ -69,7 +69,7 @@ def lobe_prior(maps: Maps, spreads: Spreads = WITHIN_MATERIAL) -> Prior:
     sigma[..., D] = spreads.lobe_diffuse[0] + spreads.lobe_diffuse[1] * maps.diffuse
     sigma[..., S] = spreads.lobe_specular[0] + spreads.lobe_specular[1] * metal
     sigma[..., R], sigma[..., N] = spreads.lobe_roughness, spreads.lobe_slope
-    return Prior(mean, sigma, _correlation(*spreads.lobe_correlation))
+    return Prior(mean, sigma, channel_correlation(*spreads.lobe_correlation))
 
 
 def network_prior(maps: Maps, sigma: dict[str, Array], spreads: Spreads = WITHIN_MATERIAL) -> Prior:
@@ -92,10 +92,10 @@ def network_prior(maps: Maps, sigma: dict[str, Array], spreads: Spreads = WITHIN
         (S, maps.specular, spreads.network_specular),
     ):
         spread[..., k] = np.minimum(spread[..., k], constant + share * albedo)
-    return Prior(mean, spread, _correlation(*spreads.network_correlation), total)
+    return Prior(mean, spread, channel_correlation(*spreads.network_correlation), total)
 
 
-def _correlation(diffuse: float, specular: float) -> Array:
+def channel_correlation(diffuse: float, specular: float) -> Array:
     """(9, 9): an albedo's channels vary together."""
     correlation = np.eye(9)
     for k, r in ((D, diffuse), (S, specular)):

@@ -20,17 +20,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from invrender.maps import Maps, map_errors, turn_maps
 from invrender.refine.gauss_newton import BAND, Observation, Refined, linearise
-from invrender.refine.priors import Prior
+from invrender.refine.priors import Prior, channel_correlation
 from invrender.refine.shared_roughness import Pooled, pool_roughness
 from invrender.refine.theta import D, N, R, S, project, to_maps
-from invrender.sampling import resize, resize_pattern
+from invrender.sampling import centres, resize, resize_pattern
 from invrender.types import TINY, Array
 
 CLEARLY = 0.9  # how much nearer the turned maps must be
@@ -83,15 +83,6 @@ class Settings:
 TOGETHER = Settings()
 
 
-@dataclass
-class RefinedTogether(Refined):
-    """photo_errors: of each photo, the RMS of what the maps leave over its mean; left_out: which
-    photos do not belong to the others."""
-
-    photo_errors: list[float] = field(default_factory=list)
-    left_out: list[int] = field(default_factory=list)
-
-
 def find_turn(maps: Maps, first: Maps) -> int:
     """Quarters, counter-clockwise, by which the sample lies turned against the first photo's.
 
@@ -136,7 +127,7 @@ def explain_together(
     samples: int = 64,
     progress: Callable[[float], None] = lambda share: None,
     s: Settings = TOGETHER,
-) -> RefinedTogether:
+) -> Refined:
     """The mode of the posterior of two photos or more, registered, from a prior's mean.
 
     Of the prior, its mean says where to start and what is metal. Ctrl-C ends it with what was found
@@ -145,7 +136,7 @@ def explain_together(
     began = time.perf_counter()
     theta = project(prior.mean.copy())
     sigma = prior.expected.copy()
-    result = RefinedTogether(to_maps(theta), sigma)
+    result = Refined(to_maps(theta), sigma)
     try:
         photos, left_out = _calibrate(observations, theta, samples, s)
         progress(0.1)
@@ -187,7 +178,7 @@ class _Photo:
     def at(self, height: int, width: int) -> _Photo:
         """The pixels nearest to the centres of so few."""
         o = self.observation
-        at = np.ix_(_centres(height, len(o.photo)), _centres(width, o.photo.shape[1]))
+        at = np.ix_(centres(height, len(o.photo)), centres(width, o.photo.shape[1]))
         clipped = None if o.clipped is None else o.clipped[at]
         return replace(self, observation=Observation(o.photo[at], o.renderer, clipped))
 
@@ -199,10 +190,6 @@ class _Photo:
             clipped = resize(o.clipped.astype(np.float32), height, width) > 0
         photo = resize(o.photo, height, width)
         return replace(self, observation=Observation(photo, o.renderer, clipped))
-
-
-def _centres(n: int, of: int) -> Array:
-    return ((np.arange(n) + 0.5) / n * of).astype(np.intp)
 
 
 @dataclass
@@ -236,7 +223,7 @@ class _Problem:
     s: Settings
 
     def evaluate(self, theta: Array) -> _Point:
-        precision = np.linalg.inv(_correlation(self.s))
+        precision = np.linalg.inv(channel_correlation(*self.s.correlation))
         hessian = precision / (self.sigma[..., :, None] * self.sigma[..., None, :])
         off = theta - self.mean
         gradient = -np.einsum("hwpq,hwq->hwp", hessian, off)
@@ -317,13 +304,6 @@ def _in_range(theta: Array) -> Array:
     return theta
 
 
-def _correlation(s: Settings) -> Array:
-    correlation = np.eye(9, dtype=np.float32)
-    for k, r in zip((D, S), s.correlation, strict=True):
-        correlation[k, k] = r + (1 - r) * np.eye(3)
-    return correlation
-
-
 def _deviations(theta: Array, rho: Array, s: Settings) -> Array:
     """Prior deviations of θ (h, W, 9), given those of ρ (h, W)."""
     low, high = s.f0_range
@@ -340,7 +320,7 @@ def _small(
 ) -> _Problem:
     """The problem of few pixels of all, with the deviation of their roughness."""
     size = min(s.grid, len(theta)), min(s.grid, theta.shape[1])
-    at = np.ix_(*(_centres(n, of) for n, of in zip(size, theta.shape, strict=False)))
+    at = np.ix_(*(centres(n, of) for n, of in zip(size, theta.shape, strict=False)))
     mean = theta[at]
     sigma = _deviations(mean, np.full(size, rho, np.float32), s)
     few = [p.at(*size) for p in photos]
@@ -390,7 +370,7 @@ def _pool(
     """The roughness of the sample's materials; sigma: the error (H, W) that is expected of θ's."""
     problem = _small(photos, theta, s.fixed, samples, s)
     size = problem.mean.shape[:2]
-    few = sigma[np.ix_(*(_centres(n, of) for n, of in zip(size, sigma.shape, strict=True)))]
+    few = sigma[np.ix_(*(centres(n, of) for n, of in zip(size, sigma.shape, strict=True)))]
 
     def solve(rho: float, start: Array) -> tuple[Array, Array]:
         problem.mean[..., R] = rho

@@ -31,8 +31,9 @@ import numpy as np
 from scipy.cluster.vq import kmeans2
 
 from invrender.refine.gauss_newton import BAND, Observation, linearise
-from invrender.refine.priors import Prior
+from invrender.refine.priors import Prior, channel_correlation
 from invrender.refine.theta import D, N, R, S, project
+from invrender.sampling import centres
 from invrender.types import TINY, Array
 
 UNKNOWNS = 7  # of a material: what θ has but slopes
@@ -207,10 +208,7 @@ def belongs(theta: Array, centres: Array, s: Settings = SHARED_SETTINGS) -> Arra
 
 def grid(image: Array, s: Settings = SHARED_SETTINGS) -> tuple[Array, Array]:
     """Indices of the pixels that are compared."""
-    rows, columns = (
-        ((np.arange(n) + 0.5) / n * of).astype(np.intp)
-        for n, of in ((min(s.side, m), m) for m in image.shape[:2])
-    )
+    rows, columns = (centres(min(s.side, n), n) for n in image.shape[:2])
     return np.ix_(rows, columns)  # type: ignore[return-value]
 
 
@@ -244,9 +242,7 @@ class _Problem:
         least, of = s.part_slope
         slopes = np.maximum(least, of * total[..., N])
         self.own = np.concatenate([own, slopes], -1).astype(np.float32)
-        self.correlation = np.eye(9)
-        for k, r in ((D, s.correlation[0]), (S, s.correlation[1])):
-            self.correlation[k, k] = r + (1 - r) * np.eye(3)
+        self.correlation = channel_correlation(*s.correlation)
         # Unresolved relief: α² grows by twice the slopes' variance.
         rho = self.theta[..., R]
         widened = (rho**4 + 2 * (total[..., N] ** 2).mean(-1)) ** 0.25 - rho
