@@ -11,7 +11,7 @@ import numpy as np
 from invrender.device import IDEAL, Device
 from invrender.files.images import PHOTOS, Photo, read_image, read_photo
 from invrender.files.maps import read_maps
-from invrender.files.rig_toml import read_rig
+from invrender.files.rig_toml import RigFile, read_rig
 from invrender.maps import Maps
 from invrender.rig import Rig
 from invrender.types import Array, InputError, Notice
@@ -73,22 +73,36 @@ def load_capture(folder: str | Path) -> Capture:
         photo = merge_bracket(photos, [p.name for p in paths])
     given = read_rig(folder / "rig.toml", fov=photo.fov)
     pattern_path = _inside(folder, given.files.get("pattern") or _find_pattern(folder))
-    pattern = read_image(pattern_path)
+    pattern = _read_pattern(pattern_path, given.device or IDEAL)
+    return _capture(photo, given, pattern, folder.resolve().name, *_read_truth(folder, given))
+
+
+def _read_pattern(path: Path, device: Device) -> Array:
+    """What a display shows of a pattern's file, its dimming to the sides left out."""
+    pattern = read_image(path)
     if pattern.min() < 0 or pattern.max() > 1 + 1e-3:
-        raise InputError(f"{pattern_path}: the pattern must be relative radiance in [0, 1]")
+        raise InputError(f"{path}: the pattern must be relative radiance in [0, 1]")
     if not pattern.max() > 0:
-        raise InputError(f"{pattern_path}: the pattern is all black")
-    told = given.device or IDEAL
-    truth = environment = None
-    if "sample" in given.files:
-        maps = _inside(folder, given.files["sample"])
-        truth = read_maps(maps)
-        if (maps / "environment.exr").is_file():
-            environment = read_image(maps / "environment.exr")
+        raise InputError(f"{path}: the pattern is all black")
+    return np.clip(device.shown(np.clip(pattern, 0, 1)), 0, 1)
+
+
+def _read_truth(folder: Path, given: RigFile) -> tuple[Maps | None, Array | None]:
+    """Maps and environment that come with a synthetic capture."""
+    if "sample" not in given.files:
+        return None, None
+    maps = _inside(folder, given.files["sample"])
+    room = maps / "environment.exr"
+    return read_maps(maps), read_image(room) if room.is_file() else None
+
+
+def _capture(
+    photo: Photo, given: RigFile, pattern: Array, name: str, truth: Maps | None, room: Array | None
+) -> Capture:
     return Capture(
-        photo, given.rig, np.clip(told.shown(np.clip(pattern, 0, 1)), 0, 1), truth, environment,
-        given.fov_from, (*photo.warnings, *given.warnings), folder.resolve().name, given.unknown,
-        device=Device(falloff=told.falloff),
+        photo, given.rig, pattern, truth, room, given.fov_from,
+        (*photo.warnings, *given.warnings), name, given.unknown,
+        device=Device(falloff=(given.device or IDEAL).falloff),
     )  # fmt: skip
 
 
@@ -102,23 +116,17 @@ def load_set(folder: str | Path) -> tuple[list[Capture], list[Array]]:
     """
     folder = Path(folder)
     names = sorted(set_patterns(folder), key=lambda p: (len(p.stem), p.stem))
-    patterns = [np.clip(read_image(path), 0, 1) for path in names]
-    truth = environment = None
-    captures = []
+    captures, patterns = [], []
+    truth: tuple[Maps | None, Array | None] | None = None
     for path in find_photos(folder):
         photo = read_photo(path)
         check_photo(photo, str(path))
         given = read_rig(folder / "rig.toml", fov=photo.fov)
-        if "sample" in given.files and truth is None:
-            maps = _inside(folder, given.files["sample"])
-            truth = read_maps(maps)
-            if (maps / "environment.exr").is_file():
-                environment = read_image(maps / "environment.exr")
-        captures.append(Capture(
-            photo, given.rig, patterns[0], truth, environment, given.fov_from,
-            (*photo.warnings, *given.warnings), f"{folder.resolve().name}/{path.stem}",
-            given.unknown,
-        ))  # fmt: skip
+        if truth is None:  # all photos are of one sample, under one display
+            truth = _read_truth(folder, given)
+            patterns = [_read_pattern(p, given.device or IDEAL) for p in names]
+        name = f"{folder.resolve().name}/{path.stem}"
+        captures.append(_capture(photo, given, patterns[0], name, *truth))
     return captures, patterns
 
 

@@ -1,0 +1,40 @@
+"""A folder of photos under a set of patterns."""
+
+import numpy as np
+import pytest
+
+from invrender.device import Device
+from invrender.files.capture import load_set
+from invrender.files.rig_toml import write_rig
+from invrender.files.write import write_exr
+from invrender.rig import Rig
+from invrender.types import InputError
+
+GAMMA = (2.0, 2.0, 2.0)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    write_rig(tmp_path / "rig.toml", Rig(), device=Device(falloff=0.5, gamma=GAMMA))
+    for i in (1, 2):
+        write_exr(tmp_path / f"pattern_{i}.exr", np.full((4, 4, 3), 0.25 * i))
+        write_exr(tmp_path / f"photo_{i}.exr", np.full((64, 80, 3), 0.1 * i))
+    return tmp_path
+
+
+def test_a_sets_patterns_are_shown_by_the_display_that_is_told(folder):
+    captures, patterns = load_set(folder)
+    assert [c.name for c in captures] == [f"{folder.name}/photo_{i}" for i in (1, 2)]
+    for i, pattern in enumerate(patterns, 1):
+        np.testing.assert_allclose(pattern, (0.25 * i) ** 2, rtol=1e-5)
+    for i, capture in enumerate(captures, 1):
+        assert capture.pattern is patterns[0]  # until it is found out
+        assert capture.device == Device(falloff=0.5) and capture.truth is None
+        assert capture.photo.image.mean() == pytest.approx(0.1 * i)
+
+
+@pytest.mark.parametrize(("value", "match"), [(2.0, r"in \[0, 1\]"), (0.0, "all black")])
+def test_a_pattern_of_a_set_that_is_none_is_refused(folder, value, match):
+    write_exr(folder / "pattern_2.exr", np.full((4, 4, 3), value))
+    with pytest.raises(InputError, match=match):
+        load_set(folder)
