@@ -25,7 +25,6 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from benchmarks.common.captures import (
     GAIN,
@@ -51,6 +50,7 @@ from invrender.pipeline import Sample, Stages, estimate_maps, reconstruct
 from invrender.render.path_traced import path_traced, sample_scene
 from invrender.render.renderer import Material
 from invrender.render.scene import make_view
+from invrender.report.advice import screen_light
 from invrender.rig import Rig
 from invrender.types import Array, InputError
 
@@ -130,7 +130,7 @@ def measure(folder: Path, size: int) -> Row:
     start = time.process_time()
     try:
         found = find_lights(load_capture(folder))
-        row["tilt"] = tilt(found.lights.rig)
+        row["tilt"] = found.lights.rig.off_nadir
         report = reconstruct(found, size=size).report
         assert report.map_error is not None
         row["notices"] = [notice.code for notice in report.warnings]
@@ -147,12 +147,6 @@ def measure_true(folder: Path, size: int, lights: Callable[[Path, Capture], Ligh
     true = lights(folder, capture)
     found = FoundLights(replace(capture, rig=true.rig), true, None, ())
     return {"error": error_of(Sample.of(found, size), capture.truth)}
-
-
-def tilt(rig: Rig) -> float:
-    """Degrees between the camera's axis and straight down."""
-    turn = Rotation.from_rotvec(rig.camera_tilt, degrees=True)
-    return float(np.degrees(np.arccos(np.clip(turn.apply([0, 0, 1])[2], -1, 1))))
 
 
 def kept(file: Path, resume: bool, make: Callable[[], Row]) -> Row:
@@ -197,14 +191,6 @@ def photo_effects(photo: Array, rig: Rig) -> dict[str, Array]:
     }
 
 
-def brightness(lights: Lights) -> float:
-    """Irradiance of the sample's middle by the screen."""
-    weights = lights.rig.screen_cosines(np.zeros(3), 32, lights.device.falloff)
-    shown = lights.shown.mean(-1)
-    cells = shown.reshape(32, len(shown) // 32, 32, -1).mean((1, 3))
-    return float((cells * weights).sum() * np.mean(lights.gain))
-
-
 def effects(i: int, drawn: CaptureSet, size: Size, given: argparse.Namespace) -> Row:
     """Errors of one sample: by effect, modelled, ignored and absent."""
     maps, room, _ = sample_and_room(i, drawn, size.maps, given.materials, given.envs)
@@ -226,7 +212,7 @@ def effects(i: int, drawn: CaptureSet, size: Size, given: argparse.Namespace) ->
     for name, (rig, device) in DISPLAYS.items():
         photo = photo_of(rig, device)
         true = replace(ideal, rig=rig, device=device)
-        believed = replace(ideal, gain=GAIN * brightness(true) / brightness(ideal))
+        believed = replace(ideal, gain=GAIN * screen_light(true) / screen_light(ideal))
         row["modelled"][name] = error(photo, true)
         row["ignored"][name] = error(photo, believed)
     for name, photo in photo_effects(plain, Rig()).items():
@@ -332,7 +318,7 @@ def main(args: argparse.Namespace) -> None:
 def read_tilt(folder: Path) -> Row:
     """How far a straight camera is believed to be tilted, in degrees."""
     try:
-        return {"tilt": tilt(find_lights(load_capture(folder)).lights.rig)}
+        return {"tilt": find_lights(load_capture(folder)).lights.rig.off_nadir}
     except InputError as error:
         return {"refused": str(error)}
 

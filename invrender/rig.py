@@ -25,6 +25,11 @@ BALL_SHAPES = ("hemisphere", "sphere")
 _LENGTHS = ("_size", "_side", "_height", "_offset", "_radius", "_shift", "_bezel")
 
 
+def fov_of(tangent: float) -> float:
+    """The field of view in degrees of a photo whose half width is so many focal lengths."""
+    return math.degrees(2 * math.atan(tangent))
+
+
 @dataclass(frozen=True)
 class Rig:
     """Sizes in metres, angles in degrees. The defaults are a tablet and a 19 mm ball.
@@ -190,6 +195,11 @@ class Rig:
     def camera_axes(self) -> Array:
         """Rows: the directions of the photo's right, its up, and towards the viewer (3, 3)."""
         return Rotation.from_rotvec(self.camera_tilt, degrees=True).as_matrix().T
+
+    @property
+    def off_nadir(self) -> float:
+        """Degrees by which the camera looks past straight down."""
+        return math.degrees(math.acos(min(1.0, float(self.camera_axes[2, 2]))))
 
     @property
     def ball_centre(self) -> Array:

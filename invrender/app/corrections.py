@@ -18,6 +18,7 @@ from invrender.capture.lights import (
     measure_lights,
     use_reflectance,
 )
+from invrender.capture.orientation import turned_photo, turned_rig
 from invrender.files.capture import Capture
 from invrender.files.images import Photo
 from invrender.rig import Rig
@@ -62,11 +63,9 @@ def turned(capture: Capture, turn: int) -> Capture:
     """The capture with its photo turned counter-clockwise by quarters, the optics as they are."""
     if turn % 4 == 0:
         return capture
-    photo, rig = capture.photo, capture.rig
-    if turn % 2:
-        tangent = math.tan(math.radians(rig.fov) / 2) * photo.height / photo.width
-        rig = replace(rig, fov=math.degrees(2 * math.atan(tangent)))
-    return replace(capture, photo=replace(photo, image=np.rot90(photo.image, turn)), rig=rig)
+    photo = capture.photo
+    rig = turned_rig(capture.rig, (photo.height, photo.width), turn)
+    return replace(capture, photo=turned_photo(photo, turn), rig=rig)
 
 
 def turn_between(before: Photo, after: Photo) -> int:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import re
 import secrets
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from invrender.files.write import atomic_path
+from invrender.app.store import read_json, write_json
+from invrender.files.rig_toml import rig_text
 from invrender.rig import BALL_SHAPES, Rig
 from invrender.types import InputError
 
@@ -72,14 +72,8 @@ class Profile:
 
     def rig_toml(self) -> str:
         """``rig.toml``: field of view, reflectance and an unknown shape are left to the photo."""
-        rig = self.rig()
-        shape = f'shape = "{self.shape}"\n' if self.shape else ""
-        return (
-            f"[screen]\nsize = {rig.screen_size!r}\nheight = {rig.screen_height!r}\n"
-            f"[camera]\noffset = {rig.camera_offset!r}\n"
-            f"[ball]\nradius = {rig.ball_radius!r}\n{shape}"
-            '[pattern]\nimage = "pattern.exr"\n'
-        )
+        unknown = {"fov", "ball_reflectance"} | ({"ball_shape"} if not self.shape else set())
+        return rig_text(self.rig(), "pattern.exr", leave=frozenset(unknown))
 
 
 def profile_of(values: Any, id: str = "") -> Profile:
@@ -95,11 +89,7 @@ def profile_of(values: Any, id: str = "") -> Profile:
 
 def read_profiles(file: Path) -> list[Profile]:
     """The profiles of a file, what cannot be read left out; the default rig where there is none."""
-    found = []
-    try:
-        entries = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        entries = []
+    found, entries = [], read_json(file)
     for entry in entries if isinstance(entries, list) else []:
         id = entry.get("id", "") if isinstance(entry, dict) else ""
         if isinstance(id, str) and re.fullmatch(r"[0-9a-f]{8}", id):
@@ -118,15 +108,10 @@ def save_profile(file: Path, profile: Profile) -> Profile:
         if len(profiles) >= MOST_PROFILES:
             raise InputError(f"there are {MOST_PROFILES} rigs already: delete one first")
     kept = [p for p in profiles if p.id != profile.id]
-    _write(file, [profile, *kept])
+    write_json(file, [asdict(p) for p in (profile, *kept)])
     return profile
 
 
 def delete_profile(file: Path, id: str) -> None:
     """Forget a profile."""
-    _write(file, [p for p in read_profiles(file) if p.id != id])
-
-
-def _write(file: Path, profiles: list[Profile]) -> None:
-    with atomic_path(file) as path:
-        path.write_text(json.dumps([asdict(p) for p in profiles], indent=1), encoding="utf-8")
+    write_json(file, [asdict(p) for p in read_profiles(file) if p.id != id])

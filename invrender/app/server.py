@@ -334,7 +334,7 @@ async def get_guide(request: Request) -> Response:
     profile = app.profile(request.path_params["id"])
     with tempfile.TemporaryDirectory(dir=app.root / "uploads") as folder:
         file = Path(folder) / "guide.pdf"
-        await app.quick.run("guide", profile.rig_toml(), str(file), seconds=EXPORT_SECONDS)
+        await app.quick.run("guide", profile.rig(), str(file), seconds=EXPORT_SECONDS)
         content = file.read_bytes()
     name = {"content-disposition": 'attachment; filename="invrender-guide.pdf"'}
     return Response(content, media_type="application/pdf", headers=name)

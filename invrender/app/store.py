@@ -93,7 +93,7 @@ def create(root: Path, name: str, rig_toml: str) -> str:
     new = root / "uploads" / id
     (new / "photos").mkdir(parents=True)
     (new / "rig.toml").write_text(rig_toml, encoding="utf-8")
-    _write_json(new / "capture.json", {"name": name[:80] or "Capture", "created": time.time()})
+    write_json(new / "capture.json", {"name": name[:80] or "Capture", "created": time.time()})
     new.rename(root / "captures" / id)
     return id
 
@@ -136,11 +136,8 @@ def photo_numbers(folder: Path) -> list[int]:
 
 def read(folder: Path) -> dict[str, Any]:
     """``capture.json``; what is missing or damaged in it has a default."""
-    try:
-        content = json.loads((folder / "capture.json").read_text(encoding="utf-8"))
-        content = content if isinstance(content, dict) else {}
-    except (OSError, ValueError):
-        content = {}
+    content = read_json(folder / "capture.json")
+    content = content if isinstance(content, dict) else {}
     defaults = {
         "name": folder.name, "created": 0.0, "notes": "", "tags": [], "files": {}, "fixes": {},
         "job": None,
@@ -151,7 +148,7 @@ def read(folder: Path) -> dict[str, Any]:
 def update(folder: Path, **changes: Any) -> dict[str, Any]:
     """Change entries of ``capture.json``; returns all of it."""
     content = {**read(folder), **changes}
-    _write_json(folder / "capture.json", content)
+    write_json(folder / "capture.json", content)
     return content
 
 
@@ -224,6 +221,7 @@ def restore(root: Path, id: str) -> None:
     (root / "trash" / id).rename(root / "captures" / id)
 
 
-def _write_json(file: Path, content: Any) -> None:
+def write_json(file: Path, content: Any) -> None:
+    """Write a JSON file, whole or not at all."""
     with atomic_path(file) as path:
         path.write_text(json.dumps(content, indent=1), encoding="utf-8")

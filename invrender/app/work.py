@@ -309,14 +309,8 @@ def tile(tell: Tell, folder: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def guide(tell: Tell, rig_toml: str, file: str) -> None:
+def guide(tell: Tell, rig: Rig, file: str) -> None:
     """The printed guide of a rig as a PDF."""
-    import tempfile
-
-    from invrender.files.rig_toml import read_rig
     from invrender.pattern.guide import write_guide
 
-    with tempfile.TemporaryDirectory() as folder:
-        rig_file = Path(folder) / "rig.toml"
-        rig_file.write_text(rig_toml, encoding="utf-8")
-        write_guide(Path(file), read_rig(rig_file).rig)
+    write_guide(Path(file), rig)

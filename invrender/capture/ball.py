@@ -37,7 +37,7 @@ from invrender.capture.settings import (
     RIM_FIT,
 )
 from invrender.files.images import Photo
-from invrender.rig import Rig
+from invrender.rig import Rig, fov_of
 from invrender.types import TINY, Array, InputError, Mask, Vec3
 
 __all__ = ["Ball", "find_ball", "make_ball", "mirror_normals", "place_ball"]
@@ -122,7 +122,7 @@ def find_fov(photo: Photo, rig: Rig, manual: tuple[float, float, float] | None =
     count = math.ceil(math.log(high / low) / math.log(FIELD_OF_VIEW.step)) + 1
     scored: list[tuple[float, Rig]] = []
     for tangent in np.geomspace(low, high, count):
-        tried = replace(rig, fov=math.degrees(2 * math.atan(tangent)))
+        tried = replace(rig, fov=fov_of(tangent))
         try:
             view, climbed = _search(photo, tried, FIELD_OF_VIEW.candidates)
         except InputError:
@@ -154,7 +154,7 @@ def find_fov(photo: Photo, rig: Rig, manual: tuple[float, float, float] | None =
 def _fov_by(ball: Ball, rig: Rig) -> float:
     """The field of view, degrees, in which that ball in the photo has the rig's radius."""
     tangent = math.tan(math.radians(rig.fov) / 2) * rig.ball_radius / ball.radius_m
-    return math.degrees(2 * math.atan(tangent))
+    return fov_of(tangent)
 
 
 def _score_measured(view: View, rig: Rig, circle: Array, blur: int) -> float:

@@ -20,10 +20,16 @@ from scipy import ndimage
 
 from invrender.capture.ball_image import sample_image
 from invrender.capture.ball_view import View, view_around
-from invrender.capture.settings import RIM_FIT, SQUARE_FIT
+from invrender.capture.settings import CROPPING, RIM_FIT, SQUARE_FIT
 from invrender.files.images import Photo
 from invrender.rig import Rig
 from invrender.types import TINY, Array, InputError
+
+
+def is_whole(photo: Photo) -> bool:
+    """Whether a photo has a shape as cameras make it, so that it was not cropped."""
+    ratio = max(photo.width, photo.height) / min(photo.width, photo.height)
+    return bool(np.abs(np.log(np.array(CROPPING.ratios) / ratio)).min() <= CROPPING.tolerance)
 
 
 def find_camera(photo: Photo, rig: Rig) -> tuple[Rig, float]:

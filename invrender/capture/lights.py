@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -235,7 +234,7 @@ def _fit_numbers(screen: Screen, rig: Rig) -> dict[str, float]:
         "saturated": screen.saturated,
         "screen_shift": shift,
         "screen_tilt": tilt,
-        "camera_tilt": math.degrees(math.acos(min(1.0, float(rig.camera_axes[2, 2])))),
+        "camera_tilt": rig.off_nadir,
     }
 
 

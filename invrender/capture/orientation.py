@@ -8,6 +8,7 @@ both: the screen's image lies on one side of it, and the pattern resembles none 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -15,12 +16,12 @@ from scipy.spatial.transform import Rotation
 
 from invrender.capture.ball import find_ball
 from invrender.capture.ball_image import unfold_pattern
-from invrender.capture.camera import find_camera
+from invrender.capture.camera import find_camera, is_whole
 from invrender.capture.mirror import Ball, make_ball, place_ball
 from invrender.capture.settings import BALL_SHAPE, CROPPING, ORIENTATION, SQUARE_FIT
 from invrender.files.capture import Capture
 from invrender.files.images import Photo
-from invrender.rig import BALL_SHAPES, Rig
+from invrender.rig import BALL_SHAPES, Rig, fov_of
 from invrender.sampling import resize_pattern
 from invrender.types import TINY, Array, InputError, Notice
 
@@ -44,10 +45,10 @@ def find_ball_and_orientation(
     photo = capture.photo
     # As it is; then with the field of view taken to be across the photo's other side.
     for first in (0, 1) if manual is None and photo.height != photo.width else (0,):
-        nominal = replace(capture, photo=_turned_photo(photo, first))
-        here, tilt_deviation = _posed(nominal)
+        nominal = replace(capture, photo=turned_photo(photo, first))
+        here, tilt_deviation = posed(nominal)
         try:
-            here, ball = _find_ball(here, manual, tilt_deviation)
+            here, ball = find_either_ball(here, manual, tilt_deviation)
             if tilt_deviation < SQUARE_FIT.unseen_tilt:  # the square shows the tilt better
                 ball = replace(ball, camera_tilt=None, tilt_deviation=None)
         except InputError as error:
@@ -55,7 +56,7 @@ def find_ball_and_orientation(
             continue
         if manual is None and here.tilt_deviation is None:
             _check_uncropped(here, ball)
-        expected = _correlation(
+        expected = likeness(
             unfold_pattern(here.photo, here.rig, ball, ORIENTATION.cells),
             resize_pattern(here.pattern, ORIENTATION.cells),
         )
@@ -67,9 +68,9 @@ def find_ball_and_orientation(
         if alike > ORIENTATION.alike and alike > expected + ORIENTATION.better:
             turned, moved = _turned(nominal, ball, turn)
             assert moved is not None
-            rig = _turned_rig(replace(capture.rig, ball_shape=here.rig.ball_shape), ball.size, turn)
+            rig = turned_rig(replace(capture.rig, ball_shape=here.rig.ball_shape), ball.size, turn)
             shown = oriented(here.pattern, quarter, mirrored)
-            here, _ = _posed(replace(nominal, photo=turned, rig=rig, pattern=shown))
+            here, _ = posed(replace(nominal, photo=turned, rig=rig, pattern=shown))
             again = place_ball(here.rig, moved.size, *moved.centre, moved.radius)
             ball = replace(
                 moved, position=again.position, radius_m=again.radius_m, ellipse=again.ellipse
@@ -97,12 +98,10 @@ def _check_uncropped(capture: Capture, ball: Ball) -> None:
     """Raise `InputError` for a photo whose shape no camera has, with the ball off its middle: the
     optical axis is then not the photo's centre."""
     photo = capture.photo
-    ratio = max(photo.width, photo.height) / min(photo.width, photo.height)
-    off = np.abs(np.log(np.array(CROPPING.ratios) / ratio)).min()
     rig = capture.rig
     expected = make_ball(rig, rig.ball_centre, rig.ball_radius, ball.size)
     distance = math.dist(ball.centre, expected.centre) / ball.radius
-    if off > CROPPING.tolerance and distance > CROPPING.off_centre:
+    if not is_whole(photo) and distance > CROPPING.off_centre:
         raise InputError(
             f"the photo seems to be cropped off centre: it has {photo.width} × {photo.height} "
             f"pixels, as no camera makes them, and the ball lies {distance:.1f} radii from its "
@@ -120,7 +119,7 @@ def not_the_pattern(ball: Ball) -> InputError:
     )
 
 
-def _find_ball(
+def find_either_ball(
     capture: Capture, manual: Circle | None, tilt_deviation: float
 ) -> tuple[Capture, Ball]:
     """The ball, a hemisphere or a sphere, whichever fits better where nobody states it; and the
@@ -148,7 +147,7 @@ def _find_ball(
     return replace(capture, rig=shaped), ball
 
 
-def _posed(capture: Capture) -> tuple[Capture, float]:
+def posed(capture: Capture) -> tuple[Capture, float]:
     """The capture with its camera where the sample's square says, unless that is known better."""
     if capture.tilt_deviation is not None:
         return capture, capture.tilt_deviation
@@ -156,21 +155,26 @@ def _posed(capture: Capture) -> tuple[Capture, float]:
     return replace(capture, rig=rig), tilt_deviation
 
 
+def seen_patterns(capture: Capture, ball: Ball) -> Iterator[tuple[int, Array]]:
+    """What the ball shows of the screen, `ORIENTATION.cells` a side, with the photo turned
+    counter-clockwise by so many quarters, where the ball can be there."""
+    for turn in range(4):
+        photo, moved = _turned(capture, ball, turn)
+        if moved is not None:
+            # The optics stay as they are, so that the angle across the other side differs.
+            rig = turned_rig(capture.rig, ball.size, turn)
+            yield turn, unfold_pattern(photo, rig, moved, ORIENTATION.cells)
+
+
 def _best_orientation(capture: Capture, ball: Ball) -> tuple[tuple[int, int, bool], float]:
     """Quarters of the photo and of the pattern, and whether that is mirrored, by which the ball
     shows the pattern best; and how alike they are then."""
     best, alike = (0, 0, False), -1.0
     pattern = resize_pattern(capture.pattern, ORIENTATION.cells)
-    for turn in range(4):
-        photo, moved = _turned(capture, ball, turn)
-        if moved is None:
-            continue
-        # The optics stay as they are, so that the angle across the other side differs.
-        rig = _turned_rig(capture.rig, ball.size, turn)
-        seen = unfold_pattern(photo, rig, moved, ORIENTATION.cells)
+    for turn, seen in seen_patterns(capture, ball):
         for mirrored in (False, True):
             for quarter in range(4):
-                score = _correlation(seen, oriented(pattern, quarter, mirrored))
+                score = likeness(seen, oriented(pattern, quarter, mirrored))
                 if score > alike:
                     alike, best = score, (turn, quarter, mirrored)
     return best, alike
@@ -200,26 +204,26 @@ def oriented(pattern: Array, quarter: int, mirrored: bool) -> Array:
     return np.ascontiguousarray(np.rot90(pattern[:, ::-1] if mirrored else pattern, quarter))
 
 
-def _turned_photo(photo: Photo, turns: int) -> Photo:
+def turned_photo(photo: Photo, turns: int) -> Photo:
     return replace(photo, image=np.rot90(photo.image, turns)) if turns % 4 else photo
 
 
-def _turned_rig(rig: Rig, size: tuple[int, int], turns: int) -> Rig:
+def turned_rig(rig: Rig, size: tuple[int, int], turns: int) -> Rig:
     """The rig with the field of view across a photo of ``size`` (H, W), turned by quarters."""
     if turns % 2 == 0:
         return rig
     tangent = math.tan(math.radians(rig.fov) / 2) * size[0] / size[1]
-    return replace(rig, fov=min(max(math.degrees(2 * math.atan(tangent)), 1), 170))
+    return replace(rig, fov=min(max(fov_of(tangent), 1), 170))
 
 
 def _turned(capture: Capture, ball: Ball, turns: int) -> tuple[Photo, Ball | None]:
     """Photo and ball turned by quarters counter-clockwise; no ball where it cannot be there."""
-    photo = _turned_photo(capture.photo, turns)
+    photo = turned_photo(capture.photo, turns)
     if turns % 4 == 0:
         return photo, ball
     (x, y), (h, w) = ball.centre, ball.size
     x, y = {1: (y, w - x), 2: (w - x, h - y), 3: (h - y, x)}[turns % 4]
-    rig = _turned_rig(capture.rig, ball.size, turns)
+    rig = turned_rig(capture.rig, ball.size, turns)
     try:
         moved = place_ball(rig, (photo.height, photo.width), x, y, ball.radius)
     except InputError:
@@ -239,7 +243,7 @@ def _turned(capture: Capture, ball: Ball, turns: int) -> tuple[Photo, Ball | Non
     return photo, replace(moved, camera_tilt=tuple(tilt.tolist()))
 
 
-def _correlation(seen: Array, shown: Array) -> float:
+def likeness(seen: Array, shown: Array) -> float:
     """Correlation in [-1, 1] of two images, each channel about its own mean and spread."""
     a, b = (x.reshape(-1, 3) - x.reshape(-1, 3).mean(0) for x in (seen, shown))
     spread = a.std(0) * b.std(0)

@@ -18,15 +18,15 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from invrender.capture.ball_image import sample_image
+from invrender.capture.camera import is_whole
 from invrender.capture.mirror import Ball
 from invrender.capture.response import Response
-from invrender.capture.settings import CROPPING, GAUSSIAN_SPREAD, SCREEN_FIT, SHEET_FIT
-from invrender.capture.table import room_irradiance
+from invrender.capture.settings import GAUSSIAN_SPREAD, SCREEN_FIT, SHEET_FIT
+from invrender.capture.table import room_irradiance, screen_irradiance
 from invrender.files.capture import Capture
 from invrender.files.images import Photo
 from invrender.lights import Lights
-from invrender.rig import Rig
-from invrender.sampling import resize_pattern
+from invrender.rig import Rig, fov_of
 from invrender.sheet import (
     FAMILY,
     MODULES,
@@ -142,7 +142,7 @@ def use_sheet(capture: Capture) -> tuple[Capture, FoundSheet | None, tuple[Notic
         focal = rig.focal(photo.width)
     start = _from_homography(places, quads, focal, _middle(photo))
     known = capture.fov_from
-    if known == "exif" and not _is_whole(photo):  # of the photo before it was cropped
+    if known == "exif" and not is_whole(photo):  # of the photo before it was cropped
         known = "unknown"
     fit, stated = _fit(photo, rig, known, places, quads, start), None
     if fit.pull > SHEET_FIT.contradiction and known in SHEET_FIT.focal_deviation:
@@ -463,13 +463,7 @@ def _fit(
 
 def _centre_deviation(photo: Photo) -> float:
     """Expected distance of the optical axis from the photo's middle, in the photo's widths."""
-    return SHEET_FIT.centre_deviation if _is_whole(photo) else SHEET_FIT.cropped_deviation
-
-
-def _is_whole(photo: Photo) -> bool:
-    """Whether the photo has a shape as cameras make it."""
-    ratio = max(photo.width, photo.height) / min(photo.width, photo.height)
-    return bool(np.abs(np.log(np.array(CROPPING.ratios) / ratio)).min() <= CROPPING.tolerance)
+    return SHEET_FIT.centre_deviation if is_whole(photo) else SHEET_FIT.cropped_deviation
 
 
 def _middle(photo: Photo) -> Array:
@@ -544,7 +538,7 @@ def _straightened(photo: Photo, camera: _Camera) -> tuple[Photo, _Camera]:
 
 def _fov(width: int, focal: float) -> float:
     """Degrees across a photo ``width`` pixels wide."""
-    return math.degrees(2 * math.atan(width / 2 / focal))
+    return fov_of(width / 2 / focal)
 
 
 def _pair(values: Array) -> tuple[float, float]:
@@ -600,9 +594,8 @@ def screen_gain(found: FoundSheet, lights: Lights) -> tuple[Array, float] | None
     if len(found.white) < SHEET_FIT.least_patches:
         return None
     cells = SHEET_FIT.screen_cells
-    pattern = resize_pattern(lights.shown, cells)
-    cosines = lights.rig.screen_cosines(found.white, cells, lights.device.falloff)
-    screen = np.einsum("nij,ijc->nc", cosines, pattern)
+    lit = lights.pattern, 1.0, lights.device
+    screen = screen_irradiance(lights.rig, found.white, lit, cells)
     environment = resample_environment(lights.environment, SHEET_FIT.environment_rows)
     room = room_irradiance(lights.rig, found.white, environment)
     seen = found.white_radiance * (math.pi / PAPER)

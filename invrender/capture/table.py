@@ -24,13 +24,20 @@ def lit_table(
     environment."""
     seen, points, use = table_blocks(photo, rig, ball)
     at = points[use]
-    count = TABLE_METER.screen_cells
-    pattern, gain, device = screen
-    cells = resize_pattern(device.shown(pattern), count) * gain
-    lit = np.einsum("nij,ijc->nc", rig.screen_cosines(at, count, device.falloff), cells)
+    lit = screen_irradiance(rig, at, screen, TABLE_METER.screen_cells)
     rows = TABLE_METER.environment_rows
     room = room_irradiance(rig, at, resample_environment(environment, rows))
     return np.log(seen[use]), at, use, lit + room
+
+
+def screen_irradiance(
+    rig: Rig, points: Array, screen: tuple[Array, Any, Device], cells: int
+) -> Array:
+    """Irradiance (n, 3) by the screen (pattern, gain, display) of ``points`` (n, 3) that face up,
+    from ``cells`` × ``cells`` parts of it."""
+    pattern, gain, device = screen
+    light = resize_pattern(device.shown(pattern), cells) * gain
+    return np.einsum("nij,ijc->nc", rig.screen_cosines(points, cells, device.falloff), light)
 
 
 def table_blocks(photo: Photo, rig: Rig, ball: Ball) -> tuple[Array, Array, Mask]:

@@ -7,8 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from invrender.capture.ball_image import unfold_pattern
-from invrender.capture.orientation import _correlation, _find_ball, _posed, _turned, _turned_rig
+from invrender.capture.orientation import find_either_ball, likeness, posed, seen_patterns
 from invrender.capture.settings import ORIENTATION, WHICH_PATTERN
 from invrender.files.capture import Capture
 from invrender.sampling import resize_pattern
@@ -22,16 +21,12 @@ def find_pattern(capture: Capture, patterns: Sequence[Array]) -> tuple[Capture, 
     quarter. Raises `InputError` where there is no ball, and where it shows none of the patterns, or
     two as well as each other.
     """
-    here, tilt_deviation = _posed(capture)
-    here, ball = _find_ball(here, None, tilt_deviation)
+    here, tilt_deviation = posed(capture)
+    here, ball = find_either_ball(here, None, tilt_deviation)
     small = [resize_pattern(p, ORIENTATION.cells) for p in patterns]
     scores = np.full((4, len(small)), -1.0)
-    for turn in range(4):
-        photo, moved = _turned(here, ball, turn)
-        if moved is not None:
-            rig = _turned_rig(here.rig, ball.size, turn)
-            seen = unfold_pattern(photo, rig, moved, ORIENTATION.cells)
-            scores[turn] = [_correlation(seen, pattern) for pattern in small]
+    for turn, seen in seen_patterns(here, ball):
+        scores[turn] = [likeness(seen, pattern) for pattern in small]
     turn, which = (int(i) for i in np.unravel_index(np.argmax(scores), scores.shape))
     best = scores.max(0)
     (x, y), r = ball.centre, ball.radius

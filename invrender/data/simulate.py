@@ -21,7 +21,7 @@ from invrender.files.maps import write_maps
 from invrender.files.rig_toml import FOUND_IN_PHOTO, write_rig
 from invrender.files.write import write_exr
 from invrender.maps import Maps
-from invrender.rig import Rig
+from invrender.rig import Rig, fov_of
 from invrender.types import Array, InputError
 
 SHEET_PIXELS = 4000.0  # a metre of the printed sheet
@@ -134,7 +134,7 @@ def _light(
 
     wide = math.ceil(width * setup.camera.wider / 2) * 2
     high = math.ceil(width * 3 // 4 * setup.camera.wider / 2) * 2
-    fov = math.degrees(2 * math.atan(math.tan(math.radians(rig.fov) / 2) * wide / width))
+    fov = fov_of(math.tan(math.radians(rig.fov) / 2) * wide / width)
     cover = None
     if setup.sheet:
         sheet = capture_sheet(setup.nominal)

@@ -5,7 +5,6 @@ Each quantity has random numbers of its own, so that one more option leaves the 
 
 from __future__ import annotations
 
-import math
 import zlib
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
@@ -14,7 +13,7 @@ import numpy as np
 
 from invrender.data.simulate_camera import HALF_WIDTH, Camera
 from invrender.device import IDEAL, Device
-from invrender.rig import Rig
+from invrender.rig import Rig, fov_of
 from invrender.types import Array, InputError, Vec3
 
 PHOTO_KINDS = ("raw", "bracket", "jpeg")
@@ -238,7 +237,7 @@ def _geometry(draw: _Draw, sphere: bool | None, camera_height: float | None) -> 
                 raise InputError(
                     f"no lens of {low:g} to {high:g} mm fits a camera {camera_height:g} m high"
                 )
-        fov = math.degrees(2 * math.atan(HALF_WIDTH / focal))
+        fov = fov_of(HALF_WIDTH / focal)
         rig = replace(rig, camera_height=float(height), fov=fov)
         if not hides(rig, CLEARANCE):
             return rig

@@ -181,8 +181,20 @@ def write_rig(
     device: Device | None = None,
     leave: frozenset[str] = frozenset(),
 ) -> None:
-    """Write ``rig.toml``. Fields at their default are left out where reading takes the default, and
-    those of ``leave``, which are to be found in the photo."""
+    """Write `rig_text` as ``rig.toml``."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(rig_text(rig, pattern, sample, device, leave), encoding="utf-8")
+
+
+def rig_text(
+    rig: Rig,
+    pattern: str = "",
+    sample: str = "",
+    device: Device | None = None,
+    leave: frozenset[str] = frozenset(),
+) -> str:
+    """What ``rig.toml`` says of a rig. Fields at their default are left out where reading takes the
+    default, and those of ``leave``, which are to be found in the photo."""
     default = Rig()
     sections: dict[str, list[str]] = {}
 
@@ -206,9 +218,7 @@ def write_rig(
         state("pattern", "image", pattern)
     if sample:
         state("sample", "maps", sample)
-    text = "".join(f"[{name}]\n" + "".join(f"{x}\n" for x in sections[name]) for name in sections)
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    return "".join(f"[{name}]\n" + "".join(f"{x}\n" for x in sections[name]) for name in sections)
 
 
 def _text(value: Any) -> str:

@@ -6,7 +6,6 @@ they and the sample exchange. The sample's BSDF is a plugin that calls `invrende
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from invrender.lights import Lights
 from invrender.maps import Maps
 from invrender.render import brdf
 from invrender.render.backend import BACKEND, dr
-from invrender.rig import Rig
+from invrender.rig import Rig, fov_of
 from invrender.sphere import mitsuba_rows
 from invrender.types import Array, Vec3
 
@@ -257,7 +256,7 @@ def scene_dict(maps: Maps, lights: Lights, *, samples: int = 64) -> dict[str, An
         "integrator": {"type": "path", "max_depth": 2},
         "sensor": {
             "type": "perspective",
-            "fov": math.degrees(2 * math.atan(rig.sample_size / 2 / z)),
+            "fov": fov_of(rig.sample_size / 2 / z),
             "fov_axis": "x",
             "principal_point_offset_x": -x / rig.sample_size,
             "principal_point_offset_y": y / rig.sample_size,

@@ -47,11 +47,16 @@ class Wanted:
 WANTED = Wanted()
 
 
-def pattern_share(lights: Lights) -> float:
-    """Share of the light on the middle of the sample that comes from the screen, in [0, 1]."""
+def screen_light(lights: Lights) -> float:
+    """Irradiance of the middle of the sample by the screen, the mean of the channels."""
     shown = resize_pattern(lights.shown, 32).mean(-1)
     cosines = lights.rig.screen_cosines(np.zeros(3), 32, lights.device.falloff)
-    screen = float(np.mean(lights.gain) * (shown * cosines).sum())
+    return float(np.mean(lights.gain) * (shown * cosines).sum())
+
+
+def pattern_share(lights: Lights) -> float:
+    """Share of the light on the middle of the sample that comes from the screen, in [0, 1]."""
+    screen = screen_light(lights)
     room = float(irradiance(lights.environment).mean())
     return screen / max(screen + room, 1e-30)
 
@@ -136,9 +141,8 @@ def _light(found: FoundLights) -> Said:
 
 def _rig(found: FoundLights) -> Said:
     rig, fit = found.lights.rig, found.lights.fit
-    tilt = math.degrees(math.acos(min(1.0, float(rig.camera_axes[2, 2]))))
-    if tilt > WANTED.camera_tilt:
-        yield "hold-level", f"the camera is tilted by {tilt:.0f}°: look straight down"
+    if rig.off_nadir > WANTED.camera_tilt:
+        yield "hold-level", f"the camera is tilted by {rig.off_nadir:.0f}°: look straight down"
     if fit.get("screen_tilt", 0) > WANTED.screen_tilt:
         tilt = fit["screen_tilt"]
         yield "level-display", f"the display hangs {tilt:.0f}° off level: rest it on equal feet"

@@ -9,6 +9,7 @@ from benchmarks import device
 from benchmarks.common.captures import OTHERS, PHOTOGRAPHS
 from invrender.device import Device
 from invrender.lights import Lights
+from invrender.report.advice import screen_light
 from invrender.rig import Rig
 
 ROWS = [
@@ -45,18 +46,16 @@ def test_its_captures_are_its_own():
 
 
 def test_tilt_is_that_of_the_axis():
-    assert device.tilt(Rig(camera_tilt=(0.0, 0.0, 30.0))) == pytest.approx(0, abs=1e-6)
-    assert device.tilt(Rig(camera_tilt=(0.6, -0.8, 0.0))) == pytest.approx(1)
+    assert Rig(camera_tilt=(0.0, 0.0, 30.0)).off_nadir == pytest.approx(0, abs=1e-6)
+    assert Rig(camera_tilt=(0.6, -0.8, 0.0)).off_nadir == pytest.approx(1)
 
 
 def test_an_ignored_display_is_believed_to_be_as_bright():
     """A display that dims is less bright at the sample than its white straight ahead."""
     ideal = Lights(Rig(), np.full((64, 64, 3), 0.5, np.float32), gain=2.0)
-    ratio = device.brightness(replace(ideal, device=Device(falloff=1.0))) / device.brightness(ideal)
+    ratio = screen_light(replace(ideal, device=Device(falloff=1.0))) / screen_light(ideal)
     assert 0.7 < ratio < 0.95
-    assert device.brightness(replace(ideal, gain=4.0)) == pytest.approx(
-        2 * device.brightness(ideal)
-    )
+    assert screen_light(replace(ideal, gain=4.0)) == pytest.approx(2 * screen_light(ideal))
 
 
 def test_cameras_leave_grey_what_is_grey():
