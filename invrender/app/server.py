@@ -31,8 +31,8 @@ from invrender.app import patterns, profiles, store
 from invrender.app.guard import Bucket, Guard, too_many
 from invrender.app.profiles import Profile
 from invrender.app.workers import Died, Worker
+from invrender.data.tablets import TABLETS
 from invrender.pattern.display import pattern_page
-from invrender.pattern.tablets import TABLETS
 from invrender.report.report import Report
 from invrender.types import InputError
 

@@ -62,13 +62,13 @@ def run(args: argparse.Namespace, console: Console) -> int:
     """Run the subcommand."""
     from rich.progress import Progress
 
+    from invrender.data.tablets import find_tablet, tablet_rig
     from invrender.files.output import check_output
     from invrender.files.rig_toml import FOUND_IN_PHOTO, read_rig, write_rig
     from invrender.files.write import atomic_path, write_exr, write_png
     from invrender.pattern.default import default_pattern, mirrored
     from invrender.pattern.display import pattern_page, write_display_png
     from invrender.pattern.guide import write_guide
-    from invrender.pattern.tablets import find_tablet, tablet_rig
     from invrender.rig import Rig
     from invrender.sampling import resize_pattern
     from invrender.types import InputError
@@ -156,12 +156,12 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 def _write_set(args: argparse.Namespace, console: Console) -> int:
     """The images of a set for the photos' folder, and the page that shows them."""
+    from invrender.data.tablets import find_tablet, tablet_rig
     from invrender.files.output import check_output
     from invrender.files.rig_toml import read_rig
     from invrender.files.write import atomic_path, write_png
     from invrender.pattern.display import pattern_page
     from invrender.pattern.sets import pattern_set
-    from invrender.pattern.tablets import find_tablet, tablet_rig
     from invrender.rig import Rig
     from invrender.types import InputError
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from invrender.data.simulate_camera import HALF_WIDTH, Camera
+from invrender.data.tablets import find_tablet
 from invrender.device import IDEAL, Device
 from invrender.rig import Rig, fov_of
 from invrender.types import Array, InputError, Vec3
@@ -68,10 +69,10 @@ RANGES = {
     "contrast": Range(0.0, 0.3, "JPEG: share of the smooth step in the tone curve"),
     "quality": Range(88, 97, "JPEG: quality"),
 }
-# Lit areas of tablets, metres, by pixels and pixels per inch: 10.9", 11" (4:3 and 16:10), 12.9",
-# 13" (3:2).
-TABLET_SIDES = ((0.2271, 0.1578), (0.2298, 0.1605), (0.2373, 0.1483), (0.2629, 0.1970),
-           (0.2740, 0.1827))  # fmt: skip
+# Displays of usual proportions: 4 : 3, 10 : 7, 16 : 10 and 3 : 2.
+DRAWN_TABLETS = (
+    "iPad Air 11", "iPad Pro 11 2018–2022", "Galaxy Tab S8 11", "iPad Pro 12.9", "Surface Pro",
+)  # fmt: skip
 PHOTO_MARGIN = 0.9  # of the photo's half width, that sample and ball reach
 CLEARANCE = 0.006  # metres by which a display stays out of the camera's view before a hand moves it
 FOCUS = 0.15  # metres; main cameras of phones focus no nearer
@@ -213,7 +214,8 @@ def _device(draw: _Draw) -> Device:
 def _geometry(draw: _Draw, sphere: bool | None, camera_height: float | None) -> Rig:
     """The rig before a hand moves it: the camera so high and so far beside that its lens sees
     sample and ball, and the display hides neither."""
-    long, short = TABLET_SIDES[int(draw.share("tablet") * len(TABLET_SIDES))]
+    tablet, _ = find_tablet(DRAWN_TABLETS[int(draw.share("tablet") * len(DRAWN_TABLETS))])
+    long, short = (round(side, 4) for side in tablet.sides)
     size = (long, short) if draw.share("landscape") < 0.5 else (short, long)
     sphere = draw.share("sphere") < 0.5 if sphere is None else sphere
     reflectance = draw("reflectance") * np.array(draw.rgb("reflectance_rgb"))

@@ -14,9 +14,9 @@ import numpy as np
 from PIL import Image
 
 from invrender.colour import linear_to_srgb
+from invrender.data.tablets import TABLETS
 from invrender.files.write import INCH, atomic_path
 from invrender.pattern.default import mirrored
-from invrender.pattern.tablets import TABLETS
 from invrender.sampling import resize_pattern
 from invrender.types import Array, InputError
 

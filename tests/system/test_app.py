@@ -73,14 +73,12 @@ def test_from_the_rig_to_a_file(server, page, tmp_path):
     click("#take")
     click("#to-gltf")
     file = tmp_path / "Example-gltf.glb"
-    again, end = time.monotonic() + 30, time.monotonic() + 90
+    end = time.monotonic() + 180
     while not file.exists() and time.monotonic() < end:
         time.sleep(0.1)
-        if time.monotonic() > again:  # a press on a button that is just drawn anew is lost
-            again = end
-            click("#to-gltf")
     used = server.processor_seconds() - before
     print(f"\n{clicks} clicks, {used:.1f} processor seconds, a second start included")
+    assert file.exists(), page.js("document.getElementById('to-gltf').parentElement.textContent")
     assert file.read_bytes()[:4] == b"glTF"
     assert clicks <= CLICKS
     # Processor seconds: wall time tells of the machine's other work. Loading and compiling anew

@@ -18,6 +18,7 @@ from rich.console import Console
 
 from invrender.cli.pattern import add_parser
 from invrender.data.environments import procedural_environment
+from invrender.data.tablets import TABLETS, find_tablet
 from invrender.files.images import read_image
 from invrender.files.rig_toml import read_rig, write_rig
 from invrender.files.write import INCH
@@ -36,7 +37,6 @@ from invrender.pattern.design import (
 from invrender.pattern.design.population import _shade
 from invrender.pattern.display import pattern_page
 from invrender.pattern.guide import _guide, _sheet, needed_focal
-from invrender.pattern.tablets import TABLETS, find_tablet
 from invrender.rig import Rig
 from invrender.sampling import resize_pattern
 from invrender.sheet import capture_sheet, marker_dictionary
