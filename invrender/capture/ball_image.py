@@ -49,8 +49,8 @@ class BallImage:
         return self.visible & (self.mirrored[..., 2] > 0)
 
     def screen(self, rig: Rig) -> Mask:
-        """(h, w): pixels that see the screen."""
-        return self.visible & screen_coordinates(rig, self.point, self.mirrored)[2]
+        """(h, w): pixels that see the screen, or its bezel, and so not the room."""
+        return self.visible & _meet(*rig.screen_body, self.point, self.mirrored)[2]
 
 
 def trace_image(rig: Rig, ball: Ball) -> BallImage:
@@ -61,13 +61,20 @@ def trace_image(rig: Rig, ball: Ball) -> BallImage:
 
 
 def screen_coordinates(rig: Rig, origin: Array, direction: Array) -> tuple[Array, Array, Mask]:
-    """Where rays meet the screen: (s, t) along its edges, and whether within its rectangle."""
-    e_x, e_y = rig.screen_edges
+    """Where rays meet the screen: (s, t) along its edges, and whether within its lit area."""
+    return _meet(rig.screen_corner, rig.screen_edges, origin, direction)
+
+
+def _meet(
+    corner: Array, edges: tuple[Array, Array], origin: Array, direction: Array
+) -> tuple[Array, Array, Mask]:
+    """Where rays meet a parallelogram: (s, t) along its edges, and whether within it."""
+    e_x, e_y = edges
     normal = np.cross(e_x, e_y)
     along = direction @ normal
     with np.errstate(divide="ignore", invalid="ignore"):
-        distance = ((rig.screen_corner - origin) @ normal) / along
-        point = origin + distance[..., None] * direction - rig.screen_corner
+        distance = ((corner - origin) @ normal) / along
+        point = origin + distance[..., None] * direction - corner
         s, t = point @ e_x / (e_x @ e_x), point @ e_y / (e_y @ e_y)
         hit = (distance > 0) & (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1)
     return s, t, hit

@@ -84,10 +84,11 @@ def distant_pairs(use: Mask) -> list[tuple[tuple[Any, Any], int]]:
 
 
 def hidden_by_screen(rig: Rig, points: Array, direction: Array) -> Mask:
-    """Whether the screen hides each of the directions (m, 3) from each of the points (n, 3)."""
-    e_x, e_y = rig.screen_edges
+    """Whether the screen, or its bezel, hides each of the directions (m, 3) from each of the points
+    (n, 3)."""
+    corner, (e_x, e_y) = rig.screen_body
     normal = np.cross(e_x, e_y)
-    from_corner = np.asarray(points) - rig.screen_corner
+    from_corner = np.asarray(points) - corner
     out = np.empty((len(from_corner), len(direction)), bool)
     step = max(1, TABLE_METER.at_once // max(len(direction), 1))
 

@@ -1,5 +1,7 @@
 """Light that is no image of the room: a veil over the ball, and the screen's own, spread."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -9,9 +11,10 @@ from invrender.capture.ball_image import trace_image
 from invrender.capture.environment import fill_environment, unfold_environment
 from invrender.capture.glare import remove_glare
 from invrender.capture.mirror import make_ball
-from invrender.capture.table import room_irradiance
+from invrender.capture.table import hidden_by_screen, room_irradiance
 from invrender.files.images import Photo
 from invrender.rig import Rig
+from invrender.sphere import directions
 
 RIG, SIZE = Rig(), (720, 960)
 BALL = make_ball(RIG, RIG.ball_centre, RIG.ball_radius, SIZE)
@@ -76,3 +79,25 @@ def test_the_screen_does_not_light_the_room_beside_it():
     (texel, light), (told_texel, told_light) = error(0), error(1.2)
     assert texel > 1 and told_texel < 0.3
     assert light > 0.05 and told_light < 0.02
+
+
+def test_a_bezel_is_not_the_room():
+    """Its black pixels in the ball are no dark wall, and what it hides does not light the table."""
+    level, bezel = 0.1, 0.03
+    rig = replace(RIG, screen_bezel=bezel)
+    image = photograph(RIG, *SIZE, lambda d: level + 0 * d, grey_table, blocks())
+    black = IMAGE.screen(rig) & ~IMAGE.screen(RIG)
+    image[IMAGE.area][black] = 0
+    photo = Photo(image)
+    seen = {}
+    for given in (RIG, rig):
+        room, coverage = unfold_environment(photo, given, IMAGE, 64)
+        seen[given] = room[:24][coverage[:24] > 0] / level
+    assert np.abs(seen[rig] - 1).max() < 0.3
+    assert seen[RIG].min() < 0.5
+    points = np.random.default_rng(1).uniform(-0.1, 0.1, (20, 3)) * [1, 1, 0]
+    d = directions(32, 64).reshape(-1, 3).astype(float)
+    larger = Rig(0.18 + 2 * bezel, sample_side=0.09, screen_shift=(bezel, 0.0, 0.0))
+    hidden = hidden_by_screen(rig, points, d)
+    np.testing.assert_array_equal(hidden, hidden_by_screen(larger, points, d))
+    assert (hidden & ~hidden_by_screen(RIG, points, d)).any()
