@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from importlib.metadata import version
@@ -28,6 +29,10 @@ from invrender.types import Array, InputError, Mask, Notice
 
 if TYPE_CHECKING:  # Dr.Jit compiles where the refinement is imported
     from invrender.refine.gauss_newton import Observation, Refined
+    from nets.predict import Corrector, Reconstructor
+
+    Networks = tuple[Reconstructor, Corrector]
+    Prepared = tuple[list[FoundLights], list["Sample"]]
 
 MEGABYTES = 200e-6, 8  # of a result: a pixel, and for the rest
 ASKED = 2  # photos of several whose maps networks estimate
@@ -65,6 +70,8 @@ class Sample:
     @classmethod
     def of(cls, found: FoundLights, size: int) -> Sample:
         """Cut out of a capture's photo, ``size`` pixels a side."""
+        if size < 1:
+            raise InputError(f"the size must be at least one pixel, got {size}")
         photo, rig = found.capture.photo, found.lights.rig
         crop, clipped = crop_sample(photo, rig, size), crop_mask(photo, rig, size)
         return cls(crop, clipped, found.lights)
@@ -92,33 +99,69 @@ def refine_capture(
     ball: tuple[float, float, float] | None = None,
     environment: Array | None = None,
     gain: Any = None,
+    prepared: Future[Prepared] | None = None,
     progress: Callable[[str], None] = lambda stage: None,
 ) -> Report:
     """Reconstruct the maps of a capture's folder and save the result to ``out``: what
     ``invrender refine`` does.
 
     more: folders of other captures of the same sample. ball, environment, gain: as for
-    `find_lights`; the rest as for `reconstruct`. Raises `InputError` for bad input, before anything
-    is written. Ctrl-C during the refinement saves the best maps so far, and is raised again; what
-    the networks made of the parts of a large image stays beside ``out``, and the same call goes on
-    from there.
+    `find_lights`; the rest as for `reconstruct`. prepared: of `prepare`, in another process, while
+    this one loads what comes after it. Raises `InputError` for bad input, before anything is written. Ctrl-C during the refinement saves the best maps so far, and is raised
+    again; what the networks made of the parts of a large image stays beside ``out``, and the same
+    call goes on from there.
     """
     folders, out = [Path(folder), *map(Path, more)], Path(out)
     check_output(out, folders, megabytes=MEGABYTES[0] * size**2 + MEGABYTES[1])
     stage = Stages(progress)
-    with stage("read"):
-        read = [_read(f) for f in folders]
-    with stage("lights"):
+    if prepared is None:
         known = {"ball": ball, "environment": environment, "gain": gain}
-        found = _find_all([(c, p) for captures, p in read for c in captures], known, stage)
+        found, crops = prepare(folders, known, size, stage)
+    with stage("read"):
+        networks = load_networks(init)
+    if prepared is not None:
+        with stage("lights"):
+            found, crops = prepared.result()
     unfinished = out.parent / f".{out.name}.unfinished"
-    result = _reconstruct(found, stage, size, init, samples, unfinished)
+    result = _reconstruct(found, crops, networks, stage, size, init, samples, unfinished)
     with stage("write"):
         result.save(out)
     if result.report.status == "interrupted":
         raise KeyboardInterrupt(f"interrupted; {out} holds the best maps so far")
     shutil.rmtree(unfinished, ignore_errors=True)
     return result.report
+
+
+def prepare(
+    folders: Sequence[Path], known: dict[str, Any], size: int, stage: Stages | None = None
+) -> Prepared:
+    """The lights of the folders' captures, and the sample as each photo shows it, ``size`` pixels a
+    side; the photos themselves are no longer needed, and left out. known: of `find_lights`."""
+    stage = stage or Stages()
+    with stage("read"):
+        read = [_read(f) for f in folders]
+    with stage("lights"):
+        found = _find_all([(c, p) for captures, p in read for c in captures], known, stage)
+    with stage("crop"):
+        return [_without_photo(f) for f in found], [Sample.of(f, size) for f in found]
+
+
+def _without_photo(found: FoundLights) -> FoundLights:
+    photo = replace(found.capture.photo, image=np.zeros((0, 0, 3), np.float32))
+    return replace(found, capture=replace(found.capture, photo=photo), sheet=None)
+
+
+def load_networks(init: str = "network") -> Networks | None:
+    """The networks that ``init`` needs, and the modules that all of a run needs after its lights:
+    Dr.Jit loads its compiler where the refinement is imported."""
+    import invrender.refine.shared
+    import invrender.report.page  # noqa: F401
+
+    if init != "network":
+        return None
+    from nets.predict import Corrector, Reconstructor
+
+    return Reconstructor(), Corrector()
 
 
 def _read(folder: Path) -> tuple[list[Capture], list[Array]]:
@@ -187,22 +230,25 @@ def reconstruct(
         result.save("out")
     """
     every = [found] if isinstance(found, FoundLights) else list(found)
-    return _reconstruct(every, Stages(progress), size, init, samples)
+    stage = Stages(progress)
+    with stage("crop"):
+        crops = [Sample.of(f, size) for f in every]
+    with stage("read"):
+        networks = load_networks(init)
+    return _reconstruct(every, crops, networks, stage, size, init, samples)
 
 
 def _reconstruct(
     found: Sequence[FoundLights],
+    crops: Sequence[Sample],
+    networks: Networks | None,
     stage: Stages,
     size: int,
     init: str,
     samples: int,
     keep: Path | None = None,
 ) -> Result:
-    if size < 1:
-        raise InputError(f"the size must be at least one pixel, got {size}")
-    with stage("crop"):
-        crops = [Sample.of(f, size) for f in found]
-    start, refined, shots = estimate_maps(crops, stage, init, samples, keep)
+    start, refined, shots = estimate_maps(crops, stage, init, samples, keep, networks)
     first, lights, renderer = crops[0], found[0].lights, shots[0].renderer
     if refined.factors:
         lights = lights.scaled(*refined.factors[0])
@@ -277,17 +323,15 @@ def estimate_maps(
     init: str = "network",
     samples: int = 64,
     keep: Path | None = None,
+    networks: Networks | None = None,
 ) -> tuple[Maps, Refined, list[Observation]]:
     """Initial and refined maps, and the photos with their forward models in the first one's frame.
 
     keep: a folder for what the networks make of parts of large images; what lies there is not
-    computed again.
+    computed again. networks: of `load_networks`, which are loaded where there are none.
     """
-    if init == "network":
-        with stage("read"):
-            from nets.predict import Corrector, Reconstructor
-
-            networks = Reconstructor(), Corrector()
+    with stage("read"):
+        networks = networks or load_networks(init)
     with stage("forward model"):
         # Dr.Jit compiles here; nothing before needs it.
         from invrender.refine.flat import flat_maps
@@ -312,6 +356,7 @@ def estimate_maps(
         with stage("materials"):
             prior = lobe_prior(fit_lobes(photos[0].photo, photos[0].renderer, samples))
     else:
+        assert networks is not None
         reconstruct, improve = networks
         # What networks know of a sample they tell from the photos whose pattern they know best.
         asked = by_pattern([c.lights.pattern for c in crops], default_pattern())[:ASKED]

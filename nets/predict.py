@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from invrender.lights import Lights
 from invrender.maps import Maps, resize_maps
 from invrender.refine.gauss_newton import linearise
-from invrender.refine.lobes import fit_lobes, read_lobes
+from invrender.refine.lobes import FIT_SIZE, fit_lobes, lobe_terms, read_lobes
 from invrender.refine.theta import to_theta
 from invrender.render.fast.estimator import Fast
 from invrender.render.renderer import Renderer
@@ -70,9 +71,13 @@ class Reconstructor:
         renderer = Fast(scene_under(lights, scale))
         report(LIGHTS_SHARE)
 
+        terms_of = cache(partial(lobe_terms, renderer))
+
         def maps_of(photo: Array, report: Callable[[float], None]) -> Prediction:
             seen = np.clip(np.nan_to_num(photo * scale, posinf=0.0, neginf=0.0), 0, MAX_PHOTO)
-            lobes = read_lobes(seen, renderer)
+            height, width = photo.shape[:2]
+            terms = terms_of(min(FIT_SIZE, height), min(FIT_SIZE, width))
+            lobes = read_lobes(seen, renderer, terms=terms)
             folder = keep and tile_folder(keep, self.notes, photo, *inputs.values())
             out = predict(self.network, batch_of(photo, inputs, lobes), report, folder)
             return replace(estimate_of(out, unit), lobes=lobes)

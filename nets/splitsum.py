@@ -15,11 +15,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from kornia.geometry.transform import remap
 from numpy.typing import NDArray
 from scipy import fft
 from scipy.ndimage import map_coordinates
@@ -42,6 +42,7 @@ LOWEST_Z = -0.95  # of a direction on Lambert's disc, whose border is -1
 GOLDEN = (5**0.5 - 1) / 2  # steps of an even sequence on the circle
 LEAST_SCREEN_COS = 0.02  # between a ray and the screen's axis: 89 degrees
 LEAST_N_V = 1e-3  # n·v of a normal that looks away from the camera
+BRDF_TABLE = Path(__file__).with_name("weights") / "brdf_table.npy"
 FAR = 1e3  # coordinates that are outside any image
 
 
@@ -177,7 +178,12 @@ def area_resize(image: Array, size: int) -> Array:
 
 
 @cache
-def brdf_table(size: int = 32, samples: int = 4096) -> Tensor:
+def brdf_table() -> Tensor:
+    """`compute_brdf_table`'s, as a file holds it: computing it takes a quarter of a second."""
+    return torch.from_numpy(np.load(BRDF_TABLE))
+
+
+def compute_brdf_table(size: int = 32, samples: int = 4096) -> NDArray[np.float32]:
     """∫ of the specular lobe under white light, k_s·B + A: (2, ρ, n·v), texel centres.
 
     Both axes go from 0 to 1. By visible normals with the height-correlated Smith term.
@@ -205,7 +211,7 @@ def brdf_table(size: int = 32, samples: int = 4096) -> Tensor:
             weight = np.where(up, lz * (nv + root_v) / (nv * root_l + lz * root_v), 0)
             fresnel = np.clip(1 - vh, 0, 1) ** 5
             table[:, a, b] = (weight * (1 - fresnel)).mean(), (weight * fresnel).mean()
-    return torch.from_numpy(table.astype(np.float32))
+    return table.astype(np.float32)
 
 
 # --- look-ups, torch ------------------------------------------------------------------------------
@@ -234,10 +240,8 @@ def sample(image: Tensor, position: Tensor, padding: str = "border") -> Tensor:
     """Bilinear look-up of (B, C, h, w) at (B, 2, H, W) in [-1, 1]², x right and y up."""
     # Torch's backward pass writes out of bounds where a coordinate is NaN.
     at = torch.nan_to_num(position).clamp(-FAR, FAR)
-    return remap(
-        image, at[:, 0], -at[:, 1],
-        padding_mode=padding, align_corners=False, normalized_coordinates=True,
-    )  # fmt: skip
+    grid = torch.stack([at[:, 0], -at[:, 1]], -1).expand(len(image), -1, -1, -1)
+    return F.grid_sample(image, grid, padding_mode=padding, align_corners=False)
 
 
 def hit_screen(position: Tensor, direction: Tensor, rig: Tensor) -> Tensor:

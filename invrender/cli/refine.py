@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from invrender.beside import beside, cores
 from invrender.cli import arguments
 
 if TYPE_CHECKING:
@@ -15,6 +17,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from invrender.cli.batch import Outcome
+    from invrender.pipeline import Prepared
 
 
 def add_parser(commands: Any) -> None:
@@ -77,17 +80,32 @@ def add_parser(commands: Any) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
+    folders = args.capture
+    known = {"ball": args.ball, "environment": _room(args.environment), "gain": args.gain}
+    options = {"size": args.size, "init": args.init, "samples": args.samples, **known}
+    if len(folders) > 1 and not args.joint:
+        return _refine_several(args, folders, options, console)
+    # Where all is loaded already there is nothing to do beside finding the lights.
+    if "torch" in sys.modules or cores() == 1:
+        return _refine_one(args, folders, options, console)
+    with beside() as submit:
+        prepared = submit(_prepare, folders, known, args.size)
+        return _refine_one(args, folders, {**options, "prepared": prepared}, console)
+
+
+def _prepare(*arguments: Any) -> Prepared:
+    from invrender.pipeline import prepare
+
+    return prepare(*arguments)
+
+
+def _refine_one(
+    args: argparse.Namespace, folders: list[Path], options: dict[str, Any], console: Console
+) -> int:
     from rich.text import Text
 
     from invrender.pipeline import refine_capture
 
-    folders = args.capture
-    options = {
-        "size": args.size, "init": args.init, "samples": args.samples, "ball": args.ball,
-        "environment": _room(args.environment), "gain": args.gain,
-    }  # fmt: skip
-    if len(folders) > 1 and not args.joint:
-        return _refine_several(args, folders, options, console)
     with console.status("") as status:
         progress = lambda stage: status.update(Text(f"{stage} …"))  # noqa: E731
         first, *more = folders
