@@ -6,6 +6,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from importlib.metadata import version
@@ -107,21 +108,27 @@ def refine_capture(
 
     more: folders of other captures of the same sample. ball, environment, gain: as for
     `find_lights`; the rest as for `reconstruct`. prepared: of `prepare`, in another process, while
-    this one loads what comes after it. Raises `InputError` for bad input, before anything is written. Ctrl-C during the refinement saves the best maps so far, and is raised
-    again; what the networks made of the parts of a large image stays beside ``out``, and the same
-    call goes on from there.
+    this one loads what comes after it. Raises `InputError` for bad input, before anything is
+    written. Ctrl-C during the refinement saves the best maps so far, and is raised again; what the
+    networks made of the parts of a large image stays beside ``out``, and the same call goes on from
+    there.
     """
     folders, out = [Path(folder), *map(Path, more)], Path(out)
     check_output(out, folders, megabytes=MEGABYTES[0] * size**2 + MEGABYTES[1])
     stage = Stages(progress)
-    if prepared is None:
-        known = {"ball": ball, "environment": environment, "gain": gain}
-        found, crops = prepare(folders, known, size, stage)
-    with stage("read"):
-        networks = load_networks(init)
+    known = {"ball": ball, "environment": environment, "gain": gain}
     if prepared is not None:
+        with stage("read"):
+            networks = load_networks(init)
         with stage("lights"):
-            found, crops = prepared.result()
+            try:
+                found, crops = prepared.result()
+            except BrokenProcessPool:  # the other process was killed
+                prepared = None
+    if prepared is None:
+        found, crops = prepare(folders, known, size, stage)
+        with stage("read"):
+            networks = load_networks(init)
     unfinished = out.parent / f".{out.name}.unfinished"
     result = _reconstruct(found, crops, networks, stage, size, init, samples, unfinished)
     with stage("write"):
@@ -256,7 +263,9 @@ def _reconstruct(
         from invrender.refine.checks import baked_light, coarse_error, photo_error
         from invrender.refine.theta import deviations
 
-        pictures = [renderer.render(maps, SAMPLES) for maps in (start, refined.maps)]
+        # The second is kept; of the first only its error is told.
+        counts = ((start, samples), (refined.maps, SAMPLES))
+        pictures = [renderer.render(maps, count) for maps, count in counts]
         before, after = (photo_error(p, first.photo, first.clipped) for p in pictures)
         baked = baked_light(refined.maps.diffuse, renderer, samples)
         coarse = coarse_error(pictures[1], first.photo, first.clipped)

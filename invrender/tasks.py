@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import multiprocessing
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -39,11 +39,12 @@ class Done:
 
 def map_tasks(
     function: Callable[[Any], Any],
-    items: Sequence[Any],
+    items: Iterable[Any],
     scheduler: str | None = None,
     workers: int = 1,
 ) -> Iterator[Done]:
-    """Apply a function to every item; yields each item's `Done` as it comes, in any order.
+    """Apply a function to every item; yields each item's `Done` as it comes, in any order. Of one
+    process, each item is asked for when the one before it is done.
 
     scheduler: the address of a Dask scheduler; needs the extra ``cluster``. Without one, a number
     of ``workers`` other than 1 means that many processes, and 1 this one. An error of one item does
@@ -66,7 +67,7 @@ def _guarded(function: Callable[[Any], Any], index: int, item: Any) -> Done:
 
 
 def _in_processes(
-    function: Callable[[Any], Any], items: Sequence[Any], workers: int
+    function: Callable[[Any], Any], items: Iterable[Any], workers: int
 ) -> Iterator[Done]:
     # A pool a process: where one dies, only its own item is lost, and known.
     context = multiprocessing.get_context("spawn")
@@ -99,7 +100,7 @@ def _in_processes(
 
 
 def _on_cluster(
-    function: Callable[[Any], Any], items: Sequence[Any], scheduler: str
+    function: Callable[[Any], Any], items: Iterable[Any], scheduler: str
 ) -> Iterator[Done]:
     try:
         import distributed

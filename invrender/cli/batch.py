@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from invrender.cli.beside import Submit, beside, cores, prepare
 from invrender.files.output import check_output
 from invrender.report.report import Report
 from invrender.tasks import map_tasks
@@ -57,7 +60,34 @@ def refine_captures(
             yield Outcome(name, "skipped", report)
         else:
             jobs.append((folder, out / name, options))
-    for done in map_tasks(_refine, jobs, scheduler, workers):
+    # One process solves a capture while another finds the lights of the next.
+    alone = len(jobs) < 2 or scheduler or workers > 1 or cores() == 1
+    with nullcontext() if alone else beside() as submit:
+        yield from _outcomes(jobs, _ahead(jobs, submit) if submit else jobs, scheduler, workers)
+
+
+Job = tuple[Path, Path, dict[str, Any]]
+
+
+def _ahead(jobs: Sequence[Job], submit: Submit) -> Iterator[Job]:
+    """The jobs, each with what is prepared for it, which for the next begins with it."""
+
+    def begin(job: Job) -> Any:
+        options = job[2]
+        known = {k: options.get(k) for k in ("ball", "environment", "gain")}
+        with suppress(BrokenProcessPool):
+            return submit(prepare, [job[0]], known, options.get("size", 256))
+
+    following = begin(jobs[0])
+    for i, (folder, out, options) in enumerate(jobs):
+        prepared, following = following, begin(jobs[i + 1]) if i + 1 < len(jobs) else None
+        yield folder, out, {**options, "prepared": prepared}
+
+
+def _outcomes(
+    jobs: Sequence[Job], items: Iterable[Job], scheduler: str | None, workers: int
+) -> Iterator[Outcome]:
+    for done in map_tasks(_refine, items, scheduler, workers):
         name = jobs[done.index][1].name
         if done.error is None:
             yield Outcome(name, "done", done.result)
@@ -77,7 +107,7 @@ def finished(folder: Path, size: int, init: str) -> Report | None:
     return report if same else None
 
 
-def _refine(job: tuple[Path, Path, dict[str, Any]]) -> Report:
+def _refine(job: Job) -> Report:
     from invrender.pipeline import refine_capture
 
     folder, out, options = job

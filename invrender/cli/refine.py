@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from invrender.beside import beside, cores
+from invrender.cli.beside import beside, cores, prepare
 from invrender.cli import arguments
 
 if TYPE_CHECKING:
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from invrender.cli.batch import Outcome
-    from invrender.pipeline import Prepared
 
 
 def add_parser(commands: Any) -> None:
@@ -86,17 +85,11 @@ def run(args: argparse.Namespace, console: Console) -> int:
     if len(folders) > 1 and not args.joint:
         return _refine_several(args, folders, options, console)
     # Where all is loaded already there is nothing to do beside finding the lights.
-    if "torch" in sys.modules or cores() == 1:
+    if "drjit" in sys.modules or cores() == 1 or args.profile:
         return _refine_one(args, folders, options, console)
     with beside() as submit:
-        prepared = submit(_prepare, folders, known, args.size)
+        prepared = submit(prepare, folders, known, args.size)
         return _refine_one(args, folders, {**options, "prepared": prepared}, console)
-
-
-def _prepare(*arguments: Any) -> Prepared:
-    from invrender.pipeline import prepare
-
-    return prepare(*arguments)
 
 
 def _refine_one(

@@ -218,6 +218,10 @@ def test_prefilter_screen_keeps_an_even_screen():
     assert near[0, 24, 2] < 0.1
 
 
+def test_table_is_what_the_file_holds():
+    np.testing.assert_allclose(splitsum.brdf_table(), splitsum.compute_brdf_table(), atol=1e-6)
+
+
 def test_table_conserves_energy():
     """A white surface reflects nearly all when smooth, and never more than comes."""
     total = splitsum.brdf_table().sum(0)

@@ -1,4 +1,4 @@
-"""A function's calls in a process beside this one. Loads nothing heavy: it is used to start early."""
+"""Calls in a process beside this one. This module loads nothing heavy: it is used early."""
 
 from __future__ import annotations
 
@@ -32,6 +32,13 @@ def beside() -> Iterator[Submit]:
         raise
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def prepare(*arguments: Any) -> Any:
+    """`invrender.pipeline.prepare`, for a process that need not load it in order to ask for it."""
+    from invrender.pipeline import prepare
+
+    return prepare(*arguments)
 
 
 def _leave_ctrl_c() -> None:
