@@ -9,8 +9,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from invrender.cli.beside import beside, cores, prepare
 from invrender.cli import arguments
+from invrender.cli.beside import beside, cores, prepare
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
