@@ -16,10 +16,10 @@ from invrender.types import Array
 
 Batch = dict[str, Tensor]
 
-# Keys of a batch with a value for each pixel.
+# Keys of a batch with a value for each pixel; the last two are for other methods (benchmarks).
 PIXELS = (
     "photo", "ideal", "maps", "clipped", "theta", "sigma0", "image", "jacobian", "lobes",
-    "evidence",
+    "evidence", "flash", "room",
 )  # fmt: skip
 
 # Fields of `MaterialEvidence`: the channels of those that are images, as packed; the others.
