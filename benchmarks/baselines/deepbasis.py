@@ -9,6 +9,8 @@ has the room's light, taken as the same from everywhere, as another unknown.
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
 
@@ -22,6 +24,7 @@ BASES = 10
 PARAMETERS = 9  # diffuse, specular, roughness, slopes
 REFERENCE = (0.1, 0.5, 0.15)  # diffuse, specular, roughness of the material whose photo is an input
 STEPS, RATE = 500, 1e-3
+ROOM, ROOM_RATE = 0.02, 0.02  # of the fit's constant room: radiance to begin with, step of its log
 MIDDLE = (-1.0,) * 3 + (-3.0,) * 3 + (0.0,) * 3  # logits of a fresh network's materials
 
 
@@ -99,8 +102,9 @@ def refine(network: DeepBasis, batch: Batch, steps: int = STEPS) -> Batch:
     with torch.no_grad():
         start, weights, moves = network.decompose(batch)
     bases = start.clone().requires_grad_()
-    room = torch.full((len(start), 3, 1, 1), -3.0, requires_grad=True)  # log radiance
-    optimiser = torch.optim.AdamW([bases, room], RATE)
+    room = torch.full((len(start), 3, 1, 1), math.log(ROOM), requires_grad=True)
+    optimiser = torch.optim.AdamW([bases], RATE)
+    optimiser.add_param_group({"params": [room], "lr": ROOM_RATE, "weight_decay": 0.0})
     photo, position = batch["flash"], batch["position"]
     for _ in range(steps):
         theta = mixed(bases, weights, moves)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+from safetensors import safe_open
 from safetensors.torch import load_file
 from torch import nn
 
@@ -58,14 +61,26 @@ def fresh(name: str) -> Any:
     return channels_last(METHODS[name][0](SIZE))
 
 
-def trained(name: str, folder: Path = WEIGHTS) -> Any:
-    """The method's network with the weights ``folder``/NAME.safetensors, in evaluation mode."""
+@cache
+def trained(name: str) -> Any:
+    """The method's network with the weights `WEIGHTS`/NAME.safetensors, in evaluation mode."""
     network = fresh(name)
-    path = folder / f"{name}.safetensors"
+    network.load_state_dict({k: v.float() for k, v in load_file(weights_of(name)).items()})
+    return network.eval()
+
+
+def weights_of(name: str) -> Path:
+    """The file of a method's weights. Raises `InputError` where it is missing."""
+    path = WEIGHTS / f"{name}.safetensors"
     if not path.is_file():
         raise InputError(f"{path} is missing; python -m benchmarks.baselines.train {name} makes it")
-    network.load_state_dict({k: v.float() for k, v in load_file(path).items()})
-    return network.eval()
+    return path
+
+
+def training_notes(name: str) -> dict[str, Any]:
+    """How a method was trained: what `benchmarks.baselines.train` wrote beside its weights."""
+    with safe_open(weights_of(name), "pt") as f:
+        return dict(json.loads(f.metadata()["notes"]))
 
 
 def parameters(network: nn.Module) -> int:
