@@ -16,7 +16,7 @@ import json
 import time
 import tomllib
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +37,7 @@ from invrender.maps import NAMES, Maps, map_errors, resize_maps
 from invrender.metrics import flip
 from invrender.pattern.default import default_pattern
 from invrender.pipeline import Stages, estimate_maps
-from invrender.render.point_lights import grid_lights, relight
+from invrender.render.point_lights import GAMMA, grid_lights, relight
 from invrender.rig import Rig
 from invrender.types import Array, InputError
 from nets.batch import Batch
@@ -47,6 +47,7 @@ from nets.predict import estimate_of
 NUMBERS = Path(__file__).with_name("paper_numbers.toml")
 SHOWN = 4  # captures whose pictures are drawn
 BEYOND = 4  # captures a point of the curves beyond the paper's
+JUDGED = (0, 4, 8)  # of the nine re-rendered images: LPIPS and FLIP take as long as all else
 LONGEST = 128  # pixels a side of captures, as of the shipped networks' training
 
 # Rows of Table 1 by key: what they are called.
@@ -92,13 +93,13 @@ def answers(capture: HeldOut, batch: Batch, steps: int) -> dict[str, tuple[list[
         if name in ("deepbasis+", "matfusion"):
             continue
         network = trained(name)
-        out = add(name, lambda network=network: network(batch))
+        out = add(name, partial(network, batch))
         if name == "ours":
             began = time.process_time()
             refined = refined_maps(capture.at(SIZE), estimate_of(out, 1.0))
             found["ours-refined"] = [refined], time.process_time() - began + found[name][1]
     basis = trained("deepbasis+")
-    add("deepbasis", lambda: basis(batch))
+    add("deepbasis", partial(basis, batch))
     with torch.enable_grad():
         began = time.process_time()
         out = deepbasis.refine(basis, batch, steps)
@@ -122,7 +123,6 @@ def answers(capture: HeldOut, batch: Batch, steps: int) -> dict[str, tuple[list[
 
 def refined_maps(capture: HeldOut, estimate: Any) -> Maps:
     """The pipeline's refinement of an estimate, without the learned correction."""
-    from invrender.refine.mirrors import take_mirrors
     from invrender.refine.posterior import explain
     from invrender.refine.priors import network_prior
     from invrender.refine.shared import share
@@ -133,18 +133,25 @@ def refined_maps(capture: HeldOut, estimate: Any) -> Maps:
     return explain(known.observations, known.prior).maps
 
 
-def errors_of(maps: Maps, truth: Maps, lpips: Lpips | None) -> dict[str, float | None]:
-    """Of maps, and of their re-renderings: RMSE, LPIPS as displayed, HDR-FLIP of radiance."""
-    rig = Rig()
-    linear = [relight(m, rig, grid_lights(rig)) for m in (maps, truth)]
-    shown = [np.clip(x, 0, 1) ** np.float32(1 / 2.2) for x in linear]
+def errors_of(
+    maps: Maps, truth: Maps, references: Array, lpips: Lpips | None
+) -> dict[str, float | None]:
+    """Of maps, and of their re-renderings: RMSE of all nine, of `JUDGED` LPIPS as displayed and
+    HDR-FLIP of radiance. references: radiance under the nine lights of the truth."""
+    linear = relight(maps, Rig(), grid_lights(Rig()))
+    pairs = [(as_displayed(linear[i]), as_displayed(references[i])) for i in range(len(linear))]
     out: dict[str, float | None] = dict(map_errors(maps, truth))
-    out["rerender"] = float(np.sqrt(np.mean((shown[0] - shown[1]) ** 2, dtype=np.float64)))
-    distances = [lpips(a, b) for a, b in zip(*shown, strict=True)] if lpips else []
-    out["lpips"] = float(np.mean([d for d in distances if d is not None])) if distances else None
-    flips = [flip(a, b, hdr=True) for a, b in zip(*linear, strict=True)]
-    out["flip"] = None if None in flips else float(np.mean(flips))  # type: ignore[arg-type]
+    squares = [np.mean((a - b) ** 2, dtype=np.float64) for a, b in pairs]
+    out["rerender"] = float(np.sqrt(np.mean(squares)))
+    out["lpips"] = _mean([lpips(*pairs[i]) for i in JUDGED]) if lpips else None
+    out["flip"] = _mean([flip(linear[i], references[i], hdr=True) for i in JUDGED])
     return out
+
+
+def as_displayed(radiance: Array) -> Array:
+    """Clipped to [0, 1], with the gamma of the re-render error."""
+    shown: Array = np.clip(radiance, 0, 1) ** np.float32(1 / GAMMA)
+    return shown
 
 
 def measure(
@@ -153,10 +160,11 @@ def measure(
     """A capture's row: errors and seconds by method, and what the denoisers leave."""
     batch = capture.batch()
     truth = capture.at(SIZE).maps
+    references = relight(truth, Rig(), grid_lights(Rig()))
     row: Row = {"capture": k, "errors": {}, "seconds": {}}
     maps: dict[str, Maps] = {}
     for name, (some, seconds) in answers(capture, batch, steps).items():
-        each = [errors_of(m, truth, lpips) for m in some]
+        each = [errors_of(m, truth, references, lpips) for m in some]
         row["errors"][name] = {c: _root_mean_square([e[c] for e in each]) for c in COLUMNS}
         row["seconds"][name], maps[name] = seconds, some[0]
     row["denoiser"] = denoised(batch)
@@ -393,7 +401,11 @@ def perturbed_tables(perturbed: dict[str, dict[str, list[Row]]]) -> dict[str, Ta
         f"Fig. 15, {kind}": table(
             [kind, "photographs", *METHODS_OF_RIG],
             [
-                [level, len(rows), *(_root_mean_square([r[m] for r in rows]) for m in METHODS_OF_RIG)]
+                [
+                    level,
+                    len(rows),
+                    *(_root_mean_square([r[m] for r in rows]) for m in METHODS_OF_RIG),
+                ]
                 for level, rows in perturbed[kind].items()
             ],
         )

@@ -115,5 +115,3 @@ def refine(network: DeepBasis, batch: Batch, steps: int = STEPS) -> Batch:
         optimiser.step()
     with torch.no_grad():
         return as_maps(mixed(bases, weights, moves))
-
-

@@ -1,11 +1,11 @@
 """Flash photos of the captures that the other methods learn from, for those that need a flash.
 
-    python -m benchmarks.baselines.flash --data DIR --out DIR --count 512
+    python -m benchmarks.baselines.flash --data DIR --out DIR --count 12
 
-copies shards of `nets.training.dataset`, shrunk to `SIZE`, and adds two photos of each capture's material in its
-room, taken from straight above without a tablet's light: ``room`` by the room's light alone, as far
-as the mirror ball shows it (so the dark tablet hides a part), ``flash`` with a point light at the
-camera too. Their unit of radiance is that of a white plane below the flash at the sample's centre,
+copies shards of `nets.training.dataset`, shrunk to `SIZE`, and adds two photos of each capture's
+material in its room, taken from straight above without a tablet's light: ``room`` by the room's
+light alone, as far as the mirror ball shows it (so the dark tablet hides a part), ``flash`` with a
+point light at the camera too. Their unit of radiance is that of a white plane below the flash at the sample's centre,
 so the flash's strength is known; that of the room is what the capture has.
 """
 
@@ -42,7 +42,9 @@ LEAST_ALPHA_SQUARED = 1e-6
 def room_of(ball: Array) -> Array:
     """The room (`ROOM_ROWS`, 2·`ROOM_ROWS`, 3) that a ball (3, S, S) of `nets.clues` shows."""
     d = directions(ROOM_ROWS, 2 * ROOM_ROWS)
-    half = d + (0, 0, 1)  # between the direction and the zenith, from where the ball is seen
+    half = d + np.array(
+        [0, 0, 1], np.float32
+    )  # between the direction and the zenith, from where the ball is seen
     half = half / np.maximum(np.linalg.norm(half, axis=-1, keepdims=True), 1e-9)
     size = ball.shape[-1]
     column = np.clip(((half[..., 0] + 1) / 2 * size).astype(int), 0, size - 1)

@@ -8,6 +8,8 @@ seed gives other maps; `several` draws some at once.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -36,7 +38,9 @@ class MatFusion(nn.Module):
         deep = width << levels
         self.multiple = 1 << levels
         self.encoder = Encoder(PARAMETERS + 3 + 3 + 2 + 2 * FREQUENCIES, width, config.encoder)
-        self.time = nn.Sequential(nn.Linear(2 * FREQUENCIES, deep), nn.GELU(), nn.Linear(deep, deep))
+        self.time = nn.Sequential(
+            nn.Linear(2 * FREQUENCIES, deep), nn.GELU(), nn.Linear(deep, deep)
+        )
         self.middle = blocks(deep, config.middle)
         self.decoder = Decoder(PARAMETERS, width, config.decoder)
 
@@ -69,7 +73,7 @@ class MatFusion(nn.Module):
         source = torch.Generator().manual_seed(seed)
         x = torch.randn(len(photo), PARAMETERS, *photo.shape[-2:], generator=source)
         times = torch.linspace(1, 0, steps + 1)
-        for now, after in zip(times[:-1], times[1:], strict=True):
+        for now, after in pairwise(times):
             (a, s), (b, t) = schedule(now), schedule(after)
             v = self.velocity(x, now.expand(len(x)), batch)
             maps, noise = (a * x - s * v).clamp(-1, 1), s * x + a * v

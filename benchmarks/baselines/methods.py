@@ -85,4 +85,3 @@ def training_notes(name: str) -> dict[str, Any]:
 
 def parameters(network: nn.Module) -> int:
     return sum(p.numel() for p in network.parameters())
-

@@ -161,4 +161,3 @@ def photograph(
     ball = inputs["ball"] / np.float32(white_level(inputs))
     flash, dark = flash_photos(resize_maps(setting.maps, SIZE, SIZE), ball, rng)
     return HeldOut(setting.maps, photo, lights, ideal, flash, dark)
-

@@ -33,9 +33,7 @@ def draw_maps(
     images: list[list[tuple[str, Array]]] = []
     for title, maps in rows.items():
         encoded = maps.encoded()
-        line = [
-            (n, linear_to_srgb(encoded[n]) if n in DISPLAYED else encoded[n]) for n in NAMES
-        ]
+        line = [(n, linear_to_srgb(encoded[n]) if n in DISPLAYED else encoded[n]) for n in NAMES]
         line.append(("re-rendered", rerender(maps)[CENTRE]))
         images.append([(title if i == 0 else "", x) for i, (_, x) in enumerate(line)])
     save_grid(file, images, (*NAMES, "re-rendered"))

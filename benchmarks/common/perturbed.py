@@ -101,7 +101,9 @@ def measure_one(
         print(f"{name} {k} is refused: {error}", flush=True)
         return dict.fromkeys(METHODS_OF_RIG)
     true = replace(true_lights(folder, found.capture), pattern=shown)
-    nominal = replace(true, rig=Rig(), pattern=default_pattern(), environment=found.lights.environment)
+    nominal = replace(
+        true, rig=Rig(), pattern=default_pattern(), environment=found.lights.environment
+    )
     errors = {}
     for method, lights in zip(METHODS_OF_RIG, (found.lights, true, nominal), strict=True):
         # What is cut out of the photo does not depend on the screen.
@@ -110,5 +112,3 @@ def measure_one(
         truth = resize_maps(capture.truth, SIZE, SIZE)  # type: ignore[arg-type]
         errors[method] = map_errors(result.maps, truth)["average"]
     return {**errors}
-
-
