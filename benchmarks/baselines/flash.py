@@ -5,8 +5,8 @@
 copies shards of `nets.training.dataset`, shrunk to `SIZE`, and adds two photos of each capture's
 material in its room, taken from straight above without a tablet's light: ``room`` by the room's
 light alone, as far as the mirror ball shows it (so the dark tablet hides a part), ``flash`` with a
-point light at the camera too. Their unit of radiance is that of a white plane below the flash at the sample's centre,
-so the flash's strength is known; that of the room is what the capture has.
+point light at the camera too. Their unit of radiance is that of a white plane below the flash at
+the sample's centre, so the flash's strength is known; that of the room is what the capture has.
 """
 
 from __future__ import annotations
