@@ -162,6 +162,6 @@ def map_errors(maps: Maps, truth: Maps) -> dict[str, float]:
     Albedos and roughness linear in [0, 1], normals encoded to [0, 1], as in the literature.
     """
     a, b = maps.encoded(), truth.encoded()
-    errors = {n: float(np.sqrt(np.mean((a[n] - b[n]).astype(np.float64) ** 2))) for n in NAMES}
+    errors = {n: float(np.sqrt(np.mean(np.square(a[n] - b[n]), dtype=np.float64))) for n in NAMES}
     errors["average"] = sum(errors.values()) / len(NAMES)
     return errors

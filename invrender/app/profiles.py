@@ -20,10 +20,12 @@ PHOTO_COUNTS = (1, 5)  # the default pattern alone, or a set
 
 @dataclass(frozen=True)
 class Profile:
-    """A rig by name. Lengths in millimetres: the pattern's ``side``, its ``height`` above the
-    table, the ``gap`` from its edge to the middle of the lens, the ball's diameter. ``shape``: of
-    the ball, or "" to find it in the photo. ``ppi``: of the display, or None if its page asks.
-    ``photos``: how many a capture has. Raises `InputError` for what no rig is."""
+    """A rig by name. Lengths in millimetres: ``side`` and ``depth`` of the pattern, along x and
+    along y (None: a square), its ``height`` above the table, the ``gap`` from its edge to the
+    middle of the lens, the ball's diameter, the ``sample``'s side (None: half of the pattern's
+    shorter one). ``shape``: of the ball, or "" to find it in the photo. ``ppi``: of the display, or
+    None if its page asks. ``photos``: how many a capture has. Raises `InputError` for what no rig
+    is."""
 
     name: str = "My tablet"
     tablet: str = ""
@@ -35,10 +37,14 @@ class Profile:
     shape: str = ""
     photos: int = 1
     id: str = ""
+    depth: float | None = None
+    sample: float | None = None
 
     def __post_init__(self) -> None:
-        for field in ("side", "height", "gap", "ball"):
+        for field in ("side", "depth", "sample", "height", "gap", "ball"):
             value = getattr(self, field)
+            if value is None and field in ("depth", "sample"):
+                continue
             if not isinstance(value, int | float) or isinstance(value, bool):
                 raise InputError(f"the rig's {field} must be a number of millimetres")
         for field in ("name", "tablet"):
@@ -56,18 +62,20 @@ class Profile:
             raise InputError("a display has 30 to 2000 pixels an inch")
         if self.photos not in PHOTO_COUNTS:
             raise InputError(f"a capture has {' or '.join(map(str, PHOTO_COUNTS))} photos")
-        if not 1 <= self.side <= 5000:
-            raise InputError("the pattern's side is 1 to 5000 mm")
+        if not all(1 <= side <= 5000 for side in (self.side, self.depth or 1)):
+            raise InputError("the pattern's sides are 1 to 5000 mm")
         self.rig()
 
     def rig(self) -> Rig:
         """The rig in metres."""
+        side = self.side / 1000
         return Rig(
-            screen_size=self.side / 1000,
+            screen_size=side if self.depth is None else (side, self.depth / 1000),
             screen_height=self.height / 1000,
             camera_offset=self.gap / 2000,
             ball_radius=self.ball / 2000,
             ball_shape=self.shape or Rig.ball_shape,
+            sample_side=None if self.sample is None else self.sample / 1000,
         )
 
     def rig_toml(self) -> str:

@@ -527,9 +527,11 @@ async def get_tablet(request: Request) -> Response:
     app = _app(request)
     profile = app.profile(request.query_params.get("profile", app.shown["profile"]))
     page = pattern_page(
-        patterns.pattern(app.shown["pattern"]), profile.side / 1000, profile.ppi,
+        patterns.pattern(app.shown["pattern"]),
+        profile.rig().screen_sides,
+        profile.ppi,
         script="/page/tablet.js",
-    )  # fmt: skip
+    )
     policy = {"content-security-policy": "frame-ancestors 'none'"}  # the page has its own
     return Response(page, media_type="text/html; charset=utf-8", headers=policy)
 

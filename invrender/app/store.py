@@ -5,6 +5,7 @@
                      shown/1/           what the page shows of it: pictures, check.json
                      result/            what `invrender refine` writes
                      exports/
+    DATA/kept/             lights that were found in photos, for as long as the program runs
     DATA/trash/ID, DATA/profiles.json, DATA/token
 
 A folder appears whole, by a rename; a name in it never comes from outside.
@@ -13,10 +14,13 @@ A folder appears whole, by a rename; a name in it never comes from outside.
 from __future__ import annotations
 
 import json
+import os
+import pickle
 import re
 import secrets
 import shutil
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +33,7 @@ ID = re.compile(r"\d{8}-\d{6}-[0-9a-f]{6}")
 LONGEST_NOTES = 10_000  # characters
 MOST_TAGS = 30
 LONGEST_TAG = 40  # characters
+MOST_KEPT = 8  # photos whose lights are kept: 150 MB each where they have 12 megapixels
 PHOTO_FILES = ("photo.jpg", "clipped.png", "check.json")
 
 
@@ -40,8 +45,9 @@ def prepare(root: Path) -> None:
     try:
         for name in ("captures", "trash"):
             (root / name).mkdir(parents=True, exist_ok=True)
-        shutil.rmtree(root / "uploads", ignore_errors=True)
-        (root / "uploads").mkdir()
+        for name in ("uploads", "kept"):
+            shutil.rmtree(root / name, ignore_errors=True)
+            (root / name).mkdir(mode=0o700)
     except OSError as error:
         raise InputError(f"{root} cannot be written: {error.strerror or error}") from None
 
@@ -209,9 +215,40 @@ def checked_fix(values: Any) -> dict[str, Any]:
     return fix
 
 
+def sources(folder: Path, number: int) -> dict[str, Any]:
+    """What is found in a photo depends on: its files, and what was set by hand."""
+    files = sorted((folder / "photos" / str(number)).iterdir())
+    stamps = [(f.name, s.st_mtime_ns, s.st_size) for f in files for s in [f.stat()]]
+    return {"files": stamps, "fix": read(folder)["fixes"].get(str(number), {})}
+
+
+def keep(folder: Path, number: int, sources: dict[str, Any], found: Any) -> None:
+    """Keep what was found in a photo, where the disk has room; `kept` brings it back."""
+    places = folder.parents[1] / "kept"
+    with suppress(OSError):
+        with atomic_path(places / f"{folder.name}-{number}") as path, path.open("wb") as out:
+            pickle.dump((sources, found), out, protocol=pickle.HIGHEST_PROTOCOL)
+        for old in sorted(places.iterdir(), key=os.path.getmtime)[:-MOST_KEPT]:
+            old.unlink(missing_ok=True)
+
+
+def kept(folder: Path, number: int) -> Any:
+    """What was found in a photo since the program began; None where there is none, or where its
+    `sources` have changed. `prepare` empties the folder, so that nothing is unpickled that this
+    program did not write."""
+    try:
+        with (folder.parents[1] / "kept" / f"{folder.name}-{number}").open("rb") as file:
+            then, found = pickle.load(file)
+    except (OSError, EOFError, pickle.UnpicklingError):
+        return None
+    return found if then == sources(folder, number) else None
+
+
 def discard(root: Path, id: str) -> None:
     """Move a capture to the trash."""
     folder_of(root, id).rename(root / "trash" / id)
+    for file in (root / "kept").glob(f"{id}-*"):
+        file.unlink(missing_ok=True)
 
 
 def restore(root: Path, id: str) -> None:

@@ -71,7 +71,8 @@ def check(tell: Tell, folder: str, number: int) -> dict[str, Any]:
     capture_folder, began = Path(folder), time.perf_counter()
     out = capture_folder / "shown" / str(number)
     out.mkdir(parents=True, exist_ok=True)
-    fix = store.read(capture_folder)["fixes"].get(str(number), {})
+    sources = store.sources(capture_folder, number)
+    fix = sources["fix"]
     answer: dict[str, Any] = {"problem": None, "fix": fix, "turn": fix.get("turn", 0)}
     try:
         capture = load_capture(capture_folder / "photos" / str(number))
@@ -88,6 +89,7 @@ def check(tell: Tell, folder: str, number: int) -> dict[str, Any]:
                     answer |= _show(turned(capture, quick["turn"]).photo, out)
                 tell(answer)
         found = find_corrected_lights(capture, fix)
+        store.keep(capture_folder, number, sources, found)
         turn = turn_between(capture.photo, found.capture.photo)
         if turn != answer["turn"]:
             answer |= _show(found.capture.photo, out)
@@ -173,8 +175,10 @@ def refine(tell: Tell, folder: str, size: int, init: str) -> None:
     found = []
     for number in store.photo_numbers(place):
         stage("lights")
-        capture = load_capture(place / "photos" / str(number))
-        lights = find_corrected_lights(capture, content["fixes"].get(str(number), {}))
+        lights = store.kept(place, number)
+        if lights is None:
+            capture = load_capture(place / "photos" / str(number))
+            lights = find_corrected_lights(capture, content["fixes"].get(str(number), {}))
         found.append(replace(lights, capture=replace(lights.capture, name=content["name"])))
     stage("preview")
     if size > PREVIEW:

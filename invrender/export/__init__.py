@@ -183,8 +183,9 @@ def export_maps(
             facts = _facts(material, target, format, convention, licence)
             (folder / "material.json").write_text(json.dumps(facts, indent=1), encoding="utf-8")
     lap("write")
+    known = _rerendered(maps)
     errors = {
-        key: {**map_errors(back, maps), "rerender": rerender_error(back, maps)}
+        key: {**map_errors(back, maps), "rerender": _difference(_rerendered(back), known)}
         for key, back in seen.items()
     }
     lap("check")
@@ -200,13 +201,19 @@ def export_maps(
 
 def rerender_error(maps: Maps, truth: Maps) -> float:
     """RMS difference over the mean of nine re-rendered images, at `CHECKED`² pixels or fewer."""
+    return _difference(_rerendered(maps), _rerendered(truth))
+
+
+def _rerendered(maps: Maps) -> Array:
     from invrender.render.point_lights import rerender
 
-    step = -(-max(truth.shape) // CHECKED)
-    a, b = (
-        rerender(Maps(*(m[::step, ::step] for m in x.__dict__.values()))) for x in (maps, truth)
-    )
-    return float(np.sqrt(np.mean((a - b) ** 2, dtype=np.float64)) / max(float(b.mean()), 1e-12))
+    step = -(-max(maps.shape) // CHECKED)
+    return rerender(Maps(*(m[::step, ::step] for m in maps.__dict__.values())))
+
+
+def _difference(image: Array, truth: Array) -> float:
+    rms = np.sqrt(np.mean(np.square(image - truth), dtype=np.float64))
+    return float(rms / max(float(truth.mean()), 1e-12))
 
 
 def _one_of(target: str, what: str, value: str | None, known: tuple[str, ...]) -> str:

@@ -30,14 +30,11 @@ def principled(mr: MetalRough, roughness: Array, normal: Array) -> Maps:
     1, as the light that is reflected again is added to it.
     """
     rig = Rig()
-    view = rig.camera - rig.sample_points(*roughness.shape)
-    view /= np.linalg.norm(view, axis=-1, keepdims=True)
-    cosine = np.clip((view * normal).sum(-1), 0, 1)
-    alpha = roughness**2
-    flat, grazing = (
-        map_coordinates(table, [cosine * (TABLE_ENTRIES - 1), alpha * (TABLE_ENTRIES - 1)], order=1)
-        for table in _albedo()
-    )
+    view = (rig.camera - rig.sample_points(*roughness.shape)).astype(np.float32)
+    length = np.sqrt(np.einsum("ijk,ijk->ij", view, view))
+    cosine = np.clip(np.einsum("ijk,ijk->ij", view, normal) / length, 0, 1)
+    at = np.stack([cosine, np.square(roughness)]) * np.float32(TABLE_ENTRIES - 1)
+    flat, grazing = (map_coordinates(t, at, output=np.float32, order=1) for t in _albedo())
     m = mr.metallic[..., None]
     flat, grazing = flat[..., None], grazing[..., None]
     f0 = mr.f0[..., None]

@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import os
 import struct
+from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -18,8 +19,8 @@ from typing import Any
 import numpy as np
 
 from invrender.export.material import Material, normal_texture, normals_seen
-from invrender.export.metalrough import F0, MetalRough, maps_of, metal_rough, with_coloured_f0
-from invrender.export.textures import Texture, encoded
+from invrender.export.metalrough import F0, MetalRough, maps_of, metallic, with_coloured_f0
+from invrender.export.textures import Texture, as_read, encoded
 from invrender.maps import Maps
 from invrender.types import Array
 
@@ -47,7 +48,9 @@ def write_gltf(material: Material, folder: Path, format: str, convention: str) -
         "normal": normal_texture(maps.normal, convention),
         "specular": Texture(np.clip(needed / scale, 0, 1), colour=True),
     }
-    files = {key: encoded(texture, format) for key, texture in textures.items()}
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        done = pool.map(encoded, textures.values(), [format] * len(textures))
+        files = dict(zip(textures, done, strict=True))
     path = folder / f"{material.name}.glb"
     _write_glb(material, path, {k: data for k, (data, _) in files.items()}, format, scale)
     seen = {k: image for k, (_, image) in files.items()}
@@ -71,13 +74,10 @@ def move_glb(folder: Path, out: Path) -> None:
 def _split(maps: Maps, format: str) -> MetalRough:
     """Metalness, then base, then f0, each computed from the rounded ones before it."""
 
-    def rounded(texture: Texture) -> Array:
-        return encoded(texture, format)[1]
-
-    m = rounded(_rough_metal(maps.roughness, metal_rough(maps).metallic))[..., 2]
+    m = as_read(_rough_metal(maps.roughness, metallic(maps)), format)[..., 2]
     for metal in (m, np.zeros_like(m)):
         mr = with_coloured_f0(maps, metal)
-        base = rounded(Texture(mr.base, colour=True))
+        base = as_read(Texture(mr.base, colour=True), format)
         error = mr.base * (1 - metal[..., None]) - maps.diffuse
         if np.sqrt(np.mean(error**2)) <= WORST_DIFFUSE:
             break

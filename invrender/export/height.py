@@ -114,10 +114,10 @@ def _least_absolute(h: Array, gx: Array, gy: Array, solve: _Poisson) -> Array:
         return h
     threshold = np.float32(max(np.quantile(spread, 0.9), 1e-5))
     for _ in range(HEIGHT_STEPS):
-        e = []
-        for d, x, v in zip(solve.gradient(h), g, u, strict=True):
-            gap = d - x + v
-            e.append(np.sign(gap) * np.maximum(np.abs(gap) - threshold, 0))
-        u = [v + d - x - r for v, d, x, r in zip(u, solve.gradient(h), g, e, strict=True)]
-        h = solve(*(x + r - v for x, r, v in zip(g, e, u, strict=True)))
+        wanted = []
+        for i, (d, x) in enumerate(zip(solve.gradient(h), g, strict=True)):
+            gap = d - x + u[i]
+            u[i] = np.clip(gap, -threshold, threshold)
+            wanted.append(x + gap - 2 * u[i])  # g + e - u, since e = gap - u
+        h = solve(*wanted)
     return h

@@ -48,7 +48,8 @@ def normals_seen(image: Array, convention: str) -> Array:
     """Unit normals from what `normal_texture` wrote."""
     sign = np.array([1, -1 if convention == "directx" else 1, 1], np.float32)
     n = (image[..., :3] * 2 - 1) * sign
-    return (n / np.linalg.norm(n, axis=-1, keepdims=True)).astype(np.float32)
+    n /= np.sqrt(np.einsum("ijk,ijk->ij", n, n))[..., None]
+    return n.astype(np.float32, copy=False)
 
 
 def height_texture(height: Array) -> Texture:

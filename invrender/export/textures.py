@@ -28,6 +28,7 @@ from invrender.types import Array, InputError
 
 FORMAT_SUFFIXES = {"png8": ".png", "png16": ".png", "exr": ".exr", "jpeg": ".jpg"}
 JPEG_QUALITY = 95
+BLOCK = 65536  # pixels that are coded at once, so that what is between stays in a processor's cache
 
 
 @dataclass(frozen=True)
@@ -44,11 +45,14 @@ class Texture:
 
 def integers(texture: Texture, levels: int) -> NDArray[np.uint16]:
     """The codes 0 … levels that an integer file holds."""
-    values = np.clip(texture.image, 0, 1).astype(np.float32)
-    if texture.colour:
-        coded = linear_to_srgb(values[..., :3])
-        values = np.concatenate([coded, values[..., 3:]], -1) if values.shape[-1] == 4 else coded
-    return (values * levels + 0.5).astype(np.uint16)
+    codes = np.empty(texture.image.shape, np.uint16)
+    step = max(1, BLOCK // codes.shape[1])
+    for top in range(0, codes.shape[0], step):
+        values = np.clip(texture.image[top : top + step], 0, 1).astype(np.float32)
+        if texture.colour:
+            values[..., :3] = linear_to_srgb(values[..., :3])
+        codes[top : top + step] = values * levels + 0.5
+    return codes
 
 
 def reals(codes: NDArray[Any], levels: int, colour: bool) -> Array:
@@ -76,8 +80,9 @@ def encoded(texture: Texture, format: str, width: float | None = None) -> tuple[
     inch: dict[str, Any] = {} if width is None else {"dpi": (columns * INCH / width,) * 2}
     if format == "png8":
         picture.save(
-            stream, format="PNG", compress_level=1, pnginfo=png_tags(texture.colour), **inch
-        )
+            stream, format="PNG", compress_level=1, compress_type=zlib.Z_RLE,
+            pnginfo=png_tags(texture.colour), **inch,
+        )  # fmt: skip
         return stream.getvalue(), reals(codes, 255, texture.colour)
     if texture.colour:
         inch["icc_profile"] = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
@@ -85,6 +90,14 @@ def encoded(texture: Texture, format: str, width: float | None = None) -> tuple[
     with Image.open(stream) as back:
         seen = np.asarray(back)
     return stream.getvalue(), reals(seen, 255, texture.colour)
+
+
+def as_read(texture: Texture, format: str) -> Array:
+    """The linear image that a reader gets from a PNG or JPEG file, made only where it is lossy."""
+    if format == "jpeg":
+        return encoded(texture, format)[1]
+    levels = 65535 if format == "png16" else 255
+    return reals(integers(texture, levels), levels, texture.colour)
 
 
 def write_texture(path: Path, texture: Texture, format: str, width: float | None = None) -> Array:

@@ -1,5 +1,5 @@
 // The page: its state as the server tells it, and the step that the address names.
-import { h, api, toast, go } from "./ui.js";
+import { h, api, toast, go, onChange } from "./ui.js";
 import { home } from "./home.js";
 import { rig } from "./rig.js";
 import { tablet } from "./tablet_step.js";
@@ -29,7 +29,8 @@ function take_in(capture) {
 }
 export { take_in as takeIn };
 
-function steps(now, id) {
+function drawSteps() {
+  const { step: now, id } = shown;
   const to = ["#/rig", "#/tablet", id ? `#/c/${id}` : "#/photo", id && `#/c/${id}/maps`, id && `#/c/${id}/files`];
   const done = id && captureOf(id)?.report;
   document.getElementById("steps").replaceChildren(now < 0 ? "" : h("ol", {}, STEPS.map((name, i) => {
@@ -40,6 +41,8 @@ function steps(now, id) {
     return h(i === now ? "li.now" : "li", {}, item);
   })));
 }
+
+const steps = onChange(() => [shown, !!(shown.id && captureOf(shown.id)?.report)], drawSteps);
 
 const ROUTES = [
   [/^$/, home, -1, "Captures"], [/^rig$/, rig, 0, "Rig"], [/^tablet$/, tablet, 1, "Tablet"],
@@ -58,7 +61,7 @@ function route() {
     const main = document.getElementById("main");
     main.replaceChildren();
     shown = { step, id: match[1] };
-    steps(step, match[1]);
+    steps();
     document.title = `${title} · invrender`;
     view = make(main, match[1]) || {};
     scrollTo(0, 0);
@@ -70,7 +73,7 @@ function route() {
 
 function update(id) {
   if (!shown) return;
-  steps(shown.step, shown.id);
+  steps();
   if (!id || !shown.id || id === shown.id) view?.update?.(id);
 }
 

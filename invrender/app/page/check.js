@@ -1,5 +1,5 @@
 // Step 3, second half: what is found in the photo, and handles to put it right.
-import { h, svg, api, attempt, go, sentence, percent } from "./ui.js";
+import { h, svg, api, attempt, go, onChange, sentence, percent } from "./ui.js";
 import { state, captureOf, discard } from "./app.js";
 
 const LINES = [["ball", "ball", "#7be08b"], ["horizon", "horizon in it", "#f2d75c"], ["screen", "screen in it", "#ff7a6b"], ["sample", "sample", "#62c2ff"], ["marker", "sheet's markers", "#ff7df0"]];
@@ -29,12 +29,15 @@ export function check(main, id) {
   const send = (values) => { clearTimeout(timer); return attempt(() => api(`/api/captures/${id}`, "PATCH", { number, fix: values })); };
   const later = () => { clearTimeout(timer); timer = setTimeout(() => { const values = fix; fix = null; send(values); }, DELAY); };
 
+  const photos = () => captureOf(id).photos.map((p) => p.number);
+  const drawTabs = onChange(() => [photos(), number], () => tabs.replaceChildren(photos().length < 2 ? "" : h("div.tabs", {}, photos().map((n) =>
+    h("button", { type: "button", "aria-pressed": String(n === number), onclick: () => { number = n; draw(); } }, `Photo ${n}`)))));
+  const drawSide = onChange(() => [number, answer()], () => side.replaceChildren(...verdict(answer())));
   let overlay, shownAt = null;
   function draw() {
     if (held) return;
     const a = answer();
-    tabs.replaceChildren(one.photos.length < 2 ? "" : h("div.tabs", {}, captureOf(id).photos.map((p) =>
-      h("button", { type: "button", "aria-pressed": String(p.number === number), onclick: () => { number = p.number; draw(); } }, `Photo ${p.number}`))));
+    drawTabs();
     if (!a || !a.size) { stage.replaceChildren(h("div.wait", {}, a?.problem ? "This file could not be shown." : "Looking at the photo …")); shownAt = null; }
     else {
       if (shownAt !== a.shown) {
@@ -47,7 +50,7 @@ export function check(main, id) {
       stage.querySelector(".clipped").hidden = off.has("clipped");
       lines(a);
     }
-    side.replaceChildren(...verdict(a));
+    drawSide();
   }
 
   function lines(a) {

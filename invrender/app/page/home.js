@@ -1,6 +1,6 @@
 // The captures on this machine, or what this is about where there are none.
-import { h, drawing, attempt, percent } from "./ui.js";
-import { state, discard, example } from "./app.js";
+import { h, drawing, attempt, onChange, percent } from "./ui.js";
+import { state, captureOf, discard, example } from "./app.js";
 
 const WORDS = { new: "photo", queued: "waiting", working: "being made", done: "maps", failed: "failed" };
 
@@ -18,9 +18,16 @@ const SCENE = `<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 440 300" fil
 <g fill="#7b8088" font-family="system-ui, sans-serif" font-size="13"><text x="64" y="44">tablet, its pattern facing down</text><text x="298" y="40">phone</text><text x="150" y="256">sample</text><text x="288" y="256">mirror ball</text></g></svg>`;
 
 export function home(main) {
-  const inside = h("div");
+  const inside = h("div"), cards = new Map();
   main.append(inside);
-  const draw = () => inside.replaceChildren(state.captures.length ? list() : welcome());
+  const ids = onChange(() => state.captures.map((c) => c.id), () => {
+    for (const c of state.captures) if (!cards.has(c.id)) cards.set(c.id, card(c));
+    inside.replaceChildren(state.captures.length ? list(state.captures.map((c) => cards.get(c.id).element)) : welcome());
+  });
+  const draw = () => {
+    ids();
+    for (const c of state.captures) cards.get(c.id).tick(c);
+  };
   draw();
   return { update: draw };
 }
@@ -37,26 +44,39 @@ function welcome() {
     art);
 }
 
-function list() {
+function list(cards) {
   return h("div", {},
     h("div.actions", {}, h("h1", {}, "Captures")),
     h("div.actions", {}, h("a.button.primary", { href: "#/rig" }, "New capture"),
       h("a.button", { href: "#/photo" }, "Add photos"),
       h("button.plain", { type: "button", onclick: (e) => attempt(example, e.target) }, "Try the example photo")),
-    h("ul.cards", {}, state.captures.map(card)),
+    h("ul.cards", {}, cards),
     h("p.soft.small", {}, "They are folders in ", h("code", {}, state.folder), "."));
 }
 
-function card(c) {
-  const first = c.photos.find((p) => p.check?.shown);
-  const source = c.report ? `/captures/${c.id}/preview_lit.jpg?${c.report.made}`
-    : first ? `/captures/${c.id}/photos/${first.number}/photo.jpg?${first.check.shown}` : null;
-  const words = c.state === "working" && c.progress ? `${WORDS.working}, ${percent(c.progress.share)}` : WORDS[c.state];
-  const problem = c.state === "new" && c.photos.some((p) => p.check?.problem);
-  return h("li.card", {},
-    h("a", { href: c.state === "new" ? `#/c/${c.id}` : `#/c/${c.id}/maps` },
-      source ? h("img", { src: source, alt: "", loading: "lazy" }) : h("div.blank"),
-      h("div.body", {}, h("b", {}, c.name), h(`span.state.${problem ? "failed" : c.state}`, {}, problem ? "needs a look" : words),
-        c.tags.length > 0 && h("div", {}, c.tags.map((t) => h("span.tag", {}, t))))),
-    h("button.more", { type: "button", "aria-label": `Discard ${c.name}`, onclick: () => attempt(() => discard(c)) }, "Discard"));
+// A capture's card, and a function that brings it up to date in place.
+function card({ id }) {
+  const picture = h("div.picture"), name = h("b"), words = h("span.state"), tags = h("div");
+  const link = h("a", {}, picture, h("div.body", {}, name, words, tags));
+  const more = h("button.more", { type: "button", onclick: () => attempt(() => discard(captureOf(id))) }, "Discard");
+  const draw = (c) => {
+    const first = c.photos.find((p) => p.check?.shown);
+    const source = c.report ? `/captures/${id}/preview_lit.jpg?${c.report.made}`
+      : first ? `/captures/${id}/photos/${first.number}/photo.jpg?${first.check.shown}` : null;
+    if (picture.dataset.source !== String(source)) {
+      picture.dataset.source = source;
+      picture.replaceChildren(source ? h("img", { src: source, alt: "", loading: "lazy" }) : h("div.blank"));
+    }
+    const problem = c.state === "new" && c.photos.some((p) => p.check?.problem);
+    link.href = c.state === "new" ? `#/c/${id}` : `#/c/${id}/maps`;
+    name.textContent = c.name;
+    words.className = `state ${problem ? "failed" : c.state}`;
+    words.textContent = problem ? "needs a look"
+      : c.state === "working" && c.progress ? `${WORDS.working}, ${percent(c.progress.share)}` : WORDS[c.state];
+    tags.replaceChildren(...c.tags.map((t) => h("span.tag", {}, t)));
+    more.setAttribute("aria-label", `Discard ${c.name}`);
+  };
+  let last = null;
+  const tick = (c) => { if (c !== last) draw(last = c); };
+  return { element: h("li.card", {}, link, more), tick };
 }

@@ -71,7 +71,7 @@ export function photo(main) {
         ? h("div.qr", {}, h("img", { src: "/qr/phone.svg", alt: "QR code of this page" }), h("p", {}, "Scan it with the phone: this page opens there, and takes its photos."))
         : h("p.soft", {}, "Started as ", h("code", {}, "invrender app --lan"), ", the program shows a QR code here that opens this page on the phone."),
       h("div", {}, h("h2", {}, "A good photo"), h("ul", {}, ["24 mm lens, no zoom, no flash, no filters", "focus on the sample, and lock it", "hands and head out of the ball's view", "a dim room is better than a bright one"].map((t) => h("li", {}, t)))))));
-  const draw = () => patterns.replaceChildren(chooser() || "");
+  const draw = chooser(patterns);
   draw();
   return { update: draw };
 }

@@ -1,13 +1,15 @@
 // Step 2: the pattern on the tablet, in step with this page.
-import { h, api, attempt } from "./ui.js";
+import { h, api, attempt, onChange } from "./ui.js";
 import { state, chosen } from "./app.js";
 
 export const NAMES = { default: "The coloured pattern", turned: "The coloured pattern, turned", stripes: "Stripes", left: "Left half white", upper: "Upper half white" };
 
 export const show = (pattern) => api("/api/shown", "POST", { pattern, profile: chosen().id });
 
-// Buttons for the patterns that a capture wants, one after another.
-export function chooser() {
+// Buttons for the patterns that a capture wants, one after another; a function that keeps them right.
+export const chooser = (into) => onChange(() => [state.shown.pattern, chosen().photos], () => into.replaceChildren(patternButtons() || ""));
+
+function patternButtons() {
   const wanted = chosen().photos > 1 ? state.patterns : state.patterns.slice(0, 1);
   if (wanted.length < 2) return null;
   return h("fieldset", {}, h("legend", {}, "The tablet shows"), h("div.choice", {}, wanted.map((name, i) =>
@@ -33,7 +35,7 @@ export function tablet(main) {
         h("div.actions", {}, h("a.button.primary", { href: "#/photo", id: "tablet-next" }, "Continue"))),
       h("aside.sheet", {}, tablet,
         h("div.actions", {}, h("a.button", { href: `/tablet?profile=${chosen().id}`, target: "_blank", rel: "noopener" }, "Open the pattern here")))));
-  const draw = () => patterns.replaceChildren(chooser() || "");
+  const draw = chooser(patterns);
   draw();
   return { update: draw };
 }

@@ -34,6 +34,18 @@ export function toast(text, action, label) {
   setTimeout(close, action ? 12000 : 8000);
 }
 
+// A function that draws only when what it shows has changed: an element that is made anew between a
+// press and its release gets no click.
+export function onChange(shown, draw) {
+  let last;
+  return () => {
+    const now = JSON.stringify(shown());
+    if (now === last) return;
+    last = now;
+    draw();
+  };
+}
+
 export const sentence = (text) => text ? text[0].toUpperCase() + text.slice(1) + (/[.!?]$/.test(text) ? "" : ".") : "";
 
 // Ask the server; what it refuses is an error with its sentence.

@@ -17,6 +17,7 @@ from PIL import Image
 from invrender.app import server as server_module
 from invrender.app import store
 from invrender.app.server import make_app
+from invrender.files.rig_toml import read_rig
 
 HOST = "localhost:8765"
 
@@ -229,7 +230,8 @@ def test_rigs_are_kept(tmp_path):
             assert status == 201
             for wrong in (
                 {"side": 0}, {"side": "1"}, {"ball": None}, {"shape": "cube"}, {"x": 1}, [1],
-                {"name": ""}, {"ppi": 5}, {"photos": 3}, {"side": True},
+                {"name": ""}, {"ppi": 5}, {"photos": 3}, {"side": True}, {"depth": 0},
+                {"sample": -1}, {"sample": "1"},
             ):  # fmt: skip
                 body = {**rig, **wrong} if isinstance(wrong, dict) else wrong
                 status, answer = await client("POST", "/api/profiles", body)
@@ -237,10 +239,19 @@ def test_rigs_are_kept(tmp_path):
             _, capture = await client.upload("a.png", png(2), f"&profile={made['id']}")
             toml = (tmp_path / "captures" / capture["id"] / "photos/1/rig.toml").read_text()
             assert "size = 0.15\n" in toml and 'shape = "sphere"' in toml and "fov" not in toml
+            # A whole display that is no square, and a sample of its own size.
+            wide = {**rig, "side": 250, "depth": 170, "sample": 60}
+            _, made_wide = await client("POST", "/api/profiles", wide)
+            _, capture = await client.upload("b.png", png(2), f"&profile={made_wide['id']}")
+            folder = tmp_path / "captures" / capture["id"] / "photos/1"
+            read = read_rig(folder / "rig.toml").rig
+            assert read.screen_sides == (0.25, 0.17) and read.sample_size == 0.06
+            _, page = await client("GET", f"/tablet?profile={made_wide['id']}")
+            assert b'data-mm="250" data-deep="170"' in page
             status, changed = await client("POST", "/api/profiles", {**made, "side": 160})
             assert changed["id"] == made["id"]
             _, state = await client("GET", "/api/state")
-            assert [p["side"] for p in state["profiles"]] == [160, 180]
+            assert [p["side"] for p in state["profiles"]] == [160, 250, 180]
 
     asyncio.run(all_of_it())
 
