@@ -46,8 +46,9 @@ class Texture:
 def integers(texture: Texture, levels: int) -> NDArray[np.uint16]:
     """The codes 0 … levels that an integer file holds."""
     codes = np.empty(texture.image.shape, np.uint16)
-    step = max(1, BLOCK // codes.shape[1])
-    for top in range(0, codes.shape[0], step):
+    rows, columns = codes.shape[:2]
+    step = max(1, BLOCK // columns)
+    for top in range(0, rows, step):
         values = np.clip(texture.image[top : top + step], 0, 1).astype(np.float32)
         if texture.colour:
             values[..., :3] = linear_to_srgb(values[..., :3])

@@ -10,6 +10,8 @@ function startViewer(data) {
   const LEVELS = 4;  // of the blurred room beyond the sharp one, as in shade.glsl
   const BLURRED = 128, IRRADIANCE = 32, REFLECTANCE = 64;  // pixels a side
   const TABLE = 0.3;  // albedo of what lies below the horizon of a sphere or cylinder
+  const FRAME = 25;  // ms that a frame may take while something moves: 30 a second, with some to spare
+  const EIGHTHS = 8, LEAST = 2;  // of the canvas's pixels a side, in which a slow viewer saves
 
   const canvas = document.getElementById("canvas"), handle = document.getElementById("handle");
   const gl = canvas.getContext("webgl2", { antialias: false, alpha: false });
@@ -19,6 +21,7 @@ function startViewer(data) {
   };
   const programs = new Map();
   let inputs, roomTexture, tableOf, stopped = false, queued = false, resting, slow = false;
+  let share = 1;  // of the pixels a side, while something moves
 
   function fail(message) {
     const note = document.getElementById("viewer-note");
@@ -197,6 +200,14 @@ function startViewer(data) {
     if (canvas.width !== size) canvas.width = canvas.height = size;
   }
 
+  // More pixels or fewer for the next frame, by what one took; a step at a time, since one frame
+  // may have waited for something else.
+  function adapt(took, most = 1) {
+    const now = share * EIGHTHS, wanted = Math.round(now * Math.sqrt(FRAME / Math.max(took, 1)));
+    const next = Math.min(Math.max(wanted, now - most), now + most);
+    share = Math.min(Math.max(next, LEAST), EIGHTHS) / EIGHTHS;
+  }
+
   // Draw soon; at rest with twice as many pixels a side, for smooth edges.
   function redraw() {
     clearTimeout(resting);
@@ -205,8 +216,8 @@ function startViewer(data) {
       queued = true;
       requestAnimationFrame(() => {
         queued = false;
-        resize(slow ? 0.7 : 1);
-        draw();
+        resize(share);
+        if (slow) adapt(frameTime(1)); else draw();
       });
     }
     resting = setTimeout(() => { resize(slow ? 1 : 2); draw(); }, 250);
@@ -319,7 +330,9 @@ function startViewer(data) {
     if (stopped) return;
     resize(1);
     draw();
-    slow = frameTime(3) > 33;  // no graphics processor: fewer pixels while something moves
+    const took = frameTime(3);
+    slow = took > FRAME;  // no graphics processor: fewer pixels while something moves
+    if (slow) adapt(took, EIGHTHS);
     connect();
     redraw();
     document.documentElement.dataset.viewer = "ready";
