@@ -46,7 +46,7 @@ class Texture:
 def integers(texture: Texture, levels: int) -> NDArray[np.uint16]:
     """The codes 0 … levels that an integer file holds."""
     codes = np.empty(texture.image.shape, np.uint16)
-    rows, columns = codes.shape[:2]
+    rows, columns = texture.image.shape[:2]
     step = max(1, BLOCK // columns)
     for top in range(0, rows, step):
         values = np.clip(texture.image[top : top + step], 0, 1).astype(np.float32)
@@ -176,7 +176,7 @@ def safe_name(text: str) -> str:
 
 def _png16(codes: NDArray[np.uint16], colour: bool, width: float | None) -> bytes:
     """A 16-bit PNG (Pillow writes colour with 8 bits only). W3C PNG 3rd ed.; filter 2, "Up"."""
-    rows, columns = codes.shape[:2]
+    rows, columns = texture.image.shape[:2]
     kind = {1: 0, 3: 2, 4: 6}[codes.shape[2] if codes.ndim == 3 else 1]
     values = np.ascontiguousarray(codes.astype(">u2")).view(np.uint8).reshape(rows, -1)
     lines = np.full((rows, values.shape[1] + 1), 2, np.uint8)
