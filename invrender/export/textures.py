@@ -176,7 +176,7 @@ def safe_name(text: str) -> str:
 
 def _png16(codes: NDArray[np.uint16], colour: bool, width: float | None) -> bytes:
     """A 16-bit PNG (Pillow writes colour with 8 bits only). W3C PNG 3rd ed.; filter 2, "Up"."""
-    rows, columns = texture.image.shape[:2]
+    rows, columns = codes.shape[:2]
     kind = {1: 0, 3: 2, 4: 6}[codes.shape[2] if codes.ndim == 3 else 1]
     values = np.ascontiguousarray(codes.astype(">u2")).view(np.uint8).reshape(rows, -1)
     lines = np.full((rows, values.shape[1] + 1), 2, np.uint8)
