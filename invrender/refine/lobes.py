@@ -17,13 +17,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.cluster.vq import kmeans2
 from scipy.ndimage import uniform_filter
 
 from invrender.colour import AXES
 from invrender.maps import Maps
 from invrender.refine.evidence import MaterialEvidence, compress
 from invrender.refine.flat import USUAL_ROUGHNESS, USUAL_SPECULAR, diffuse_rest, plane_terms
+from invrender.refine.groups import group
 from invrender.render.renderer import Renderer
 from invrender.sampling import centres, resize
 from invrender.types import TINY, Array
@@ -215,12 +215,11 @@ def _select(label: Labels, images: list[Array]) -> Array:
 
 
 def _group(albedo: Array) -> Labels:
-    """Labels (H, W) of pixels of like albedo, by k-means on its square root."""
+    """Labels (H, W) of pixels of like albedo, by its square root."""
     points = np.sqrt(albedo.reshape(-1, 3)).astype(np.float64)
     if len(np.unique(points.round(3), axis=0)) < 10 * MATERIALS:
         return np.zeros(albedo.shape[:2], np.intp)
-    _, label = kmeans2(points, MATERIALS, minit="++", rng=np.random.default_rng(0))
-    return np.unique(label, return_inverse=True)[1].reshape(albedo.shape[:2])
+    return group(points, MATERIALS)[1].reshape(albedo.shape[:2])
 
 
 def _moments(photo: Array, terms: list[Any]) -> Array:

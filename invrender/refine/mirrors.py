@@ -66,10 +66,12 @@ def take_mirrors(
     if not taken:
         return prior
     where = np.isin(label, taken)[..., None]
+    sigma = lobe_prior(to_maps(theta)).sigma
     return replace(
         prior,
         mean=np.where(where, theta, prior.mean),
-        sigma=np.where(where, lobe_prior(to_maps(theta)).sigma, prior.sigma),
+        sigma=np.where(where, sigma, prior.sigma),
+        total=np.where(where, sigma, prior.expected),
     )
 
 

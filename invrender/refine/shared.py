@@ -28,9 +28,9 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from scipy.cluster.vq import kmeans2
 
 from invrender.refine.gauss_newton import BAND, Observation, linearise
+from invrender.refine.groups import group
 from invrender.refine.priors import Prior, channel_correlation
 from invrender.refine.theta import D, N, R, S, project
 from invrender.sampling import centres
@@ -50,6 +50,8 @@ class Settings:
     parts: int = 16  # a side, whose means are compared
     independent: float = 0.3  # of the parts: what the model lacks is wider than one of them
     noise: tuple[float, float] = (0.03, 0.01)  # of the pixel and of the photo's mean
+    mixing: float = 0.6  # of what neighbours differ by: blur, resampling, colours of a JPEG
+    neighbour: int = 2  # pixels away
     freedom: float = 4.0  # Student's, of a part's residual
     steps: int = 5
     settled: float = 0.3  # decrease of the cost, -2 log posterior, that ends the steps
@@ -67,7 +69,7 @@ class Settings:
     part_roughness: float = 0.01
     part_slope: tuple[float, float] = (0.005, 0.15)  # at least; of a pixel's expected error
     correlation: tuple[float, float] = (0.9, 0.95)  # of the channels of k_d, and of k_s
-    relief: float = 0.5  # deviation of the share of the expected slopes that widens the lobe
+    relief: float = 1.0  # deviation of the share of the unresolved slopes that widens the lobe
     metal_f0: tuple[float, float] = (0.06, 0.36)  # k_s of no metal, and of nothing but metal
     dielectric_f0: tuple[float, float] = (0.08, 0.15)  # surely dielectric; no longer one
     least_doubt: float = 0.001  # of the logarithm of the screen's radiance, at least
@@ -80,7 +82,6 @@ class Settings:
     mirror_weight: float = 1.5  # of sqrt(f0)
     alike_distance: float = 0.12  # of groups that are one
     softness: float = 0.05  # deviation of a pixel from its group
-    jitter: float = 1e-4  # of pixels, so that no two are the same
     least_part: float = 0.02  # of the sample that a group has
     shared_error: float = 0.5  # of a network's squared error that a material shares
 
@@ -114,7 +115,7 @@ def share(
     prior: a network's maps (H, W, 9), ``total`` their expected errors.
     """
     theta = plain_dielectric(project(prior.mean.copy()), s)
-    centres = group(theta[grid(theta, s)], s)
+    centres = materials(theta[grid(theta, s)], s)
     problem = _Problem(observations, prior, theta, centres, samples, s)
     solved = _solve(problem, s)
     z, left = problem.offsets(solved.u, solved.covariance)
@@ -181,16 +182,13 @@ def _features(theta: Array, s: Settings) -> Array:
     return np.concatenate([np.sqrt(theta[..., D]), mirror, theta[..., R : R + 1]], -1)
 
 
-def group(theta: Array, s: Settings = SHARED_SETTINGS) -> Array:
+def materials(theta: Array, s: Settings = SHARED_SETTINGS) -> Array:
     """Centres (materials, 5) of like pixels of maps θ."""
-    points = _features(theta, s).reshape(-1, 5).astype(np.float64)
-    mean = points.mean(0, keepdims=True)
-    if len(points) < s.materials or points.std(0).max() < s.softness:
-        return mean
-    rng = np.random.default_rng(0)
-    points += s.jitter * rng.standard_normal(points.shape)
-    centres, label = kmeans2(points, s.materials, minit="++", rng=rng)
-    shares = np.bincount(label, minlength=len(centres)) / len(points)
+    points = _features(theta, s).reshape(-1, 5)
+    if points.std(0).max() < s.softness:
+        return points.mean(0, keepdims=True)
+    centres, label = group(points, s.materials)
+    shares = np.bincount(label) / len(points)
     kept: list[Array] = []
     for k in np.argsort(-shares):
         apart = all(np.linalg.norm(centres[k] - c) > s.alike_distance for c in kept)
@@ -212,6 +210,17 @@ def grid(image: Array, s: Settings = SHARED_SETTINGS) -> tuple[Array, Array]:
     return np.ix_(rows, columns)  # type: ignore[return-value]
 
 
+def contrast(photo: Array, s: Settings = SHARED_SETTINGS) -> Array:
+    """By how much the pixels that are compared differ from the mean of four neighbours."""
+    rows, columns = grid(photo, s)
+    height, width = photo.shape[:2]
+    near = np.zeros((rows.size, columns.size, *photo.shape[2:]), np.float32)
+    for step in (-s.neighbour, s.neighbour):
+        near += photo[np.clip(rows + step, 0, height - 1), columns] / 4
+        near += photo[rows, np.clip(columns + step, 0, width - 1)] / 4
+    return np.abs(near - photo[rows, columns])
+
+
 def parts_of(height: int, width: int, s: Settings = SHARED_SETTINGS) -> Any:
     """Which part each pixel lies in (H·W), from 0."""
     rows, columns = (np.arange(n) * min(s.parts, n) // n for n in (height, width))
@@ -230,6 +239,7 @@ class _Problem:
         self.theta = theta[at]
         self.weight = belongs(self.theta, centres, s)
         self.photos = [o.photo[at] for o in observations]
+        self.mixing = [(s.mixing * contrast(o.photo, s)) ** 2 for o in observations]
         self.seen = [
             np.ones(self.theta.shape[:2]) if o.clipped is None else ~o.clipped[at] * 1.0
             for o in observations
@@ -243,9 +253,11 @@ class _Problem:
         slopes = np.maximum(least, of * total[..., N])
         self.own = np.concatenate([own, slopes], -1).astype(np.float32)
         self.correlation = channel_correlation(*s.correlation)
-        # Unresolved relief: α² grows by twice the slopes' variance.
+        # Unresolved relief: α² grows by twice the slopes' variance. Of real relief there is about
+        # as much again as networks find.
         rho = self.theta[..., R]
-        widened = (rho**4 + 2 * (total[..., N] ** 2).mean(-1)) ** 0.25 - rho
+        unresolved = (total[..., N] ** 2 + self.theta[..., N] ** 2).mean(-1)
+        widened = (rho**4 + 2 * unresolved) ** 0.25 - rho
         size = np.maximum(self.weight.sum((0, 1)), 1e-9)
         widened = s.relief * np.einsum("hw,hwk->k", widened, self.weight) / size
         self.apparent = np.ones((len(centres), UNKNOWNS))  # deviation of z as it is seen
@@ -322,7 +334,7 @@ class _Problem:
             for c in range(3):
                 lights[..., c, c], lights[..., c, 3 + c] = screen[..., c], room[..., c]
         own = jacobian * self.own[..., None, :]
-        noise = (s.noise[0] * photo) ** 2 + (s.noise[1] * photo.mean()) ** 2
+        noise = (s.noise[0] * photo) ** 2 + (s.noise[1] * photo.mean()) ** 2 + self.mixing[i]
         shared = jacobian[..., :UNKNOWNS] * self.shared[..., None, :]
         parts = []
         for k in range(self.materials):

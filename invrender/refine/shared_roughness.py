@@ -14,9 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.cluster.vq import kmeans2
 from scipy.spatial.distance import cdist
 
+from invrender.refine.groups import group
 from invrender.refine.theta import D, R, S
 from invrender.types import Array
 
@@ -115,10 +115,5 @@ def _features(theta: Array) -> Array:
 
 
 def _groups(features: Array, s: Settings) -> NDArray[np.intp]:
-    """A label a pixel, by k-means."""
-    count = min(s.materials, len(features) // s.least)
-    if count < 2 or float(features.std(0).max()) < 1e-4:
-        return np.zeros(len(features), np.intp)
-    rng = np.random.default_rng(0)
-    points = features + 1e-3 * rng.standard_normal(features.shape)  # no two alike
-    return kmeans2(points, count, minit="++", rng=rng)[1].astype(np.intp)
+    """A label a pixel."""
+    return group(features, max(1, min(s.materials, len(features) // s.least)))[1]

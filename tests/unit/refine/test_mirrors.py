@@ -46,6 +46,7 @@ def test_a_near_mirror_is_taken_from_the_lobes(renderer, k_d, k_s, rho):
     found = taken(renderer.render(truth), renderer, prior_of(blurred))
     assert map_errors(to_maps(found.mean), truth)["average"] < 0.01
     assert found.sigma[..., R].max() < 0.03
+    assert np.array_equal(found.expected, found.sigma)
 
 
 def test_one_half_may_be_a_mirror(renderer):
@@ -57,7 +58,10 @@ def test_one_half_may_be_a_mirror(renderer):
     prior = prior_of(start)
     found = taken(renderer.render(truth), renderer, prior)
     assert (found.mean[:, : half - 1, R] == 0.05).mean() > 0.95
-    assert (found.mean[:, half + 1 :] == prior.mean[:, half + 1 :]).mean() > 0.95
+    rest = np.s_[:, half + 1 :]
+    assert (found.mean[rest] == prior.mean[rest]).mean() > 0.95
+    assert (found.expected[rest] == prior.expected[rest]).mean() > 0.95
+    assert (found.expected[:, : half - 1] == found.sigma[:, : half - 1]).mean() > 0.95
 
 
 def test_maps_that_explain_the_photo_stay(renderer):

@@ -8,7 +8,7 @@ from invrender.maps import constant_maps, map_errors
 from invrender.pattern.default import block_pattern
 from invrender.refine.gauss_newton import Observation
 from invrender.refine.priors import network_prior
-from invrender.refine.shared import belongs, group, light_doubt, plain_dielectric, share
+from invrender.refine.shared import belongs, light_doubt, materials, plain_dielectric, share
 from invrender.refine.theta import D, R, S, to_maps, to_theta
 from invrender.render.fast.estimator import Fast
 from invrender.render.scene import make_scene
@@ -172,12 +172,12 @@ def test_groups_are_materials():
     maps = constant_maps(SIZE, SIZE, (0.3, 0.15, 0.08), 0.04, 0.7)
     maps.diffuse[:8], maps.specular[:8], maps.roughness[:8] = 0, 0.7, 0.3
     theta = to_theta(maps)
-    weight = belongs(theta, group(theta))
+    weight = belongs(theta, materials(theta))
     assert weight.shape == (SIZE, SIZE, 2)
     np.testing.assert_allclose(weight.sum(-1), 1, atol=1e-5)
     first = int(weight[-1, 0].argmax())
     assert (weight[8:, :, first] > 0.99).all() and (weight[:8, :, first] < 0.01).all()
-    assert group(to_theta(constant_maps(8, 8, 0.4, 0.04, 0.5))).shape == (1, 5)
+    assert materials(to_theta(constant_maps(8, 8, 0.4, 0.04, 0.5))).shape == (1, 5)
 
 
 def test_dielectric_mirrors_alike():
@@ -213,5 +213,5 @@ def test_paint_of_two_sheens_is_two_materials():
     for off in (0.05, 0.3):
         maps = constant_maps(SIZE, SIZE, 0.2, 0.04, 0.3)
         maps.roughness[: SIZE // 2] += off
-        found[off] = len(group(to_theta(maps)))
+        found[off] = len(materials(to_theta(maps)))
     assert found == {0.05: 1, 0.3: 2}
