@@ -8,7 +8,13 @@ from invrender.maps import constant_maps, map_errors
 from invrender.pattern.default import block_pattern
 from invrender.refine.gauss_newton import Observation
 from invrender.refine.priors import network_prior
-from invrender.refine.shared import belongs, light_doubt, materials, plain_dielectric, share
+from invrender.refine.shared import (
+    belongs,
+    light_doubt,
+    materials,
+    plain_dielectric,
+    share,
+)
 from invrender.refine.theta import D, R, S, to_maps, to_theta
 from invrender.render.fast.estimator import Fast
 from invrender.render.scene import make_scene
@@ -109,6 +115,22 @@ def test_unresolved_relief_is_no_roughness(renderer):
         moved[slopes] = float(found.prior.mean[..., R].mean()) - 0.3
     assert moved[0.01] > 0.06
     assert 0 < moved[0.1] < 0.5 * moved[0.01]
+
+
+def test_relief_that_the_maps_have_tells_of_more(renderer):
+    """Of steep relief there is about as much again as the maps have."""
+    truth = constant_maps(SIZE, SIZE, 0, 0.8, 0.3)
+    moved = {}
+    for steep in (0.0, 0.15):
+        theta = to_theta(truth)
+        theta[..., 7] += steep * np.where(np.arange(SIZE) % 2, 1, -1)
+        start = to_maps(theta)
+        theta[..., R] = 0.38
+        photo = renderer.render(to_maps(theta))
+        found = share([Observation(photo, renderer)], prior_of(start, normal=0.001))
+        moved[steep] = float(found.prior.mean[..., R].mean()) - 0.3
+    assert moved[0.0] > 0.06
+    assert 0 < moved[0.15] < 0.6 * moved[0.0]
 
 
 def test_doubtful_room_is_found(renderer):
