@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
@@ -36,6 +35,7 @@ if TYPE_CHECKING:  # Dr.Jit compiles where the refinement is imported
     Prepared = tuple[list[FoundLights], list["Sample"]]
 
 MEGABYTES = 200e-6, 8  # of a result: a pixel, and for the rest
+FINE = 256  # pixels a side up to which a kept rendering takes `SAMPLES`; its cost grows with them
 ASKED = 2  # photos of several whose maps networks estimate
 MEASURING_PHOTOS = 3  # photos from which these count for more than what networks know
 
@@ -109,9 +109,7 @@ def refine_capture(
     more: folders of other captures of the same sample. ball, environment, gain: as for
     `find_lights`; the rest as for `reconstruct`. prepared: of `prepare`, in another process, while
     this one loads what comes after it. Raises `InputError` for bad input, before anything is
-    written. Ctrl-C during the refinement saves the best maps so far, and is raised again; what the
-    networks made of the parts of a large image stays beside ``out``, and the same call goes on from
-    there.
+    written. Ctrl-C during the refinement saves the best maps so far, and is raised again.
     """
     folders, out = [Path(folder), *map(Path, more)], Path(out)
     check_output(out, folders, megabytes=MEGABYTES[0] * size**2 + MEGABYTES[1])
@@ -129,13 +127,11 @@ def refine_capture(
         found, crops = prepare(folders, known, size, stage)
         with stage("read"):
             networks = load_networks(init)
-    unfinished = out.parent / f".{out.name}.unfinished"
-    result = _reconstruct(found, crops, networks, stage, size, init, samples, unfinished)
+    result = _reconstruct(found, crops, networks, stage, size, init, samples)
     with stage("write"):
         result.save(out)
     if result.report.status == "interrupted":
         raise KeyboardInterrupt(f"interrupted; {out} holds the best maps so far")
-    shutil.rmtree(unfinished, ignore_errors=True)
     return result.report
 
 
@@ -253,9 +249,8 @@ def _reconstruct(
     size: int,
     init: str,
     samples: int,
-    keep: Path | None = None,
 ) -> Result:
-    start, refined, shots = estimate_maps(crops, stage, init, samples, keep, networks)
+    start, refined, shots = estimate_maps(crops, stage, init, samples, networks)
     first, lights, renderer = crops[0], found[0].lights, shots[0].renderer
     if refined.factors:
         lights = lights.scaled(*refined.factors[0])
@@ -263,8 +258,8 @@ def _reconstruct(
         from invrender.refine.checks import baked_light, coarse_error, photo_error
         from invrender.refine.theta import deviations
 
-        # The second is kept; of the first only its error is told.
-        counts = ((start, samples), (refined.maps, SAMPLES))
+        # The second is kept; of the first, and of many pixels, only the error matters.
+        counts = ((start, samples), (refined.maps, SAMPLES if size <= FINE else samples))
         pictures = [renderer.render(maps, count) for maps, count in counts]
         before, after = (photo_error(p, first.photo, first.clipped) for p in pictures)
         baked = baked_light(refined.maps.diffuse, renderer, samples)
@@ -331,13 +326,11 @@ def estimate_maps(
     stage: Stages,
     init: str = "network",
     samples: int = 64,
-    keep: Path | None = None,
     networks: Networks | None = None,
 ) -> tuple[Maps, Refined, list[Observation]]:
     """Initial and refined maps, and the photos with their forward models in the first one's frame.
 
-    keep: a folder for what the networks make of parts of large images; what lies there is not
-    computed again. networks: of `load_networks`, which are loaded where there are none.
+    networks: of `load_networks`, which are loaded where there are none.
     """
     with stage("read"):
         networks = networks or load_networks(init)
@@ -371,7 +364,7 @@ def estimate_maps(
         asked = by_pattern([c.lights.pattern for c in crops], default_pattern())[:ASKED]
         with stage("initial maps"):
             told = stage.part("initial maps")
-            estimates = [reconstruct(crops[i].photo, crops[i].lights, told, keep) for i in asked]
+            estimates = [reconstruct(crops[i].photo, crops[i].lights, told) for i in asked]
         start = turn_maps(estimates[0].maps, -turns[asked[0]])
         lobes = estimates[0].lobes if len(photos) == 1 else None
         with stage("refine"):

@@ -24,14 +24,13 @@ from invrender.types import Array, InputError
 from nets.batch import Batch, batch_of, lobe_input, positions
 from nets.clues import light_inputs, white_level
 from nets.model import LEAST_LEVEL, MAPS, MAX_PHOTO
-from nets.scales import COARSE, WHOLE, Prediction, fitting, joined, shaded, shrunk
+from nets.scales import COARSE, WHOLE, Prediction, enlarged, fitting, shaded, shrunk
 from nets.store import load_weights
-from nets.tiles import predict, tile_folder
 
 WEIGHTS = Path(__file__).with_name("weights")
 PASSES = 3  # of the correction, at most
 SETTLED = 0.04  # mean change of roughness from which on another pass follows
-LEAST_LENGTH = 1e-6  # of a normal that is a mean over tiles
+LEAST_LENGTH = 1e-6  # of a normal
 LIGHTS_SHARE = 0.3  # of the time that a reconstruction takes: the preparation of the lights
 
 
@@ -46,16 +45,13 @@ class Reconstructor:
         photo: Array,
         lights: Lights,
         progress: Callable[[float], None] | None = None,
-        keep: Path | None = None,
     ) -> Prediction:
         """Maps of the sample from its photo (H, W, 3), linear radiance, row 0 at +y.
 
-        The maps of a photo larger than `WHOLE` take their large shades and expected errors from it
-        shrunk to that.
+        Of a photo larger than `WHOLE` they are those of it shrunk to that, `enlarged`.
 
         lights: in the photo's unit of radiance, whatever that is. Pixels that are not finite count
-        as black. ``progress`` is told the share done. keep: a folder for the tiles of an image of
-        several; those that lie there are not computed again.
+        as black. ``progress`` is told the share done.
         """
         photo = np.asarray(photo, np.float32)
         if photo.ndim != 3 or photo.shape[2] != 3 or 0 in photo.shape:
@@ -73,23 +69,29 @@ class Reconstructor:
 
         terms_of = cache(partial(lobe_terms, renderer))
 
-        def maps_of(photo: Array, report: Callable[[float], None]) -> Prediction:
+        def maps_of(photo: Array) -> Prediction:
             seen = np.clip(np.nan_to_num(photo * scale, posinf=0.0, neginf=0.0), 0, MAX_PHOTO)
             height, width = photo.shape[:2]
             terms = terms_of(min(FIT_SIZE, height), min(FIT_SIZE, width))
             lobes = read_lobes(seen, renderer, terms=terms)
-            folder = keep and tile_folder(keep, self.notes, photo, *inputs.values())
-            out = predict(self.network, batch_of(photo, inputs, lobes), report, folder)
+            out = predict(self.network, batch_of(photo, inputs, lobes))
             return replace(estimate_of(out, unit), lobes=lobes)
 
-        found = maps_of(photo, lambda share: report(LIGHTS_SHARE + (1 - LIGHTS_SHARE) * share))
-        if max(photo.shape[:2]) > WHOLE:
-            small = maps_of(resize(photo, *fitting(photo, WHOLE)), lambda share: None)
-            found = joined(found, small)
-        if max(photo.shape[:2]) > COARSE:
-            coarse = maps_of(resize(photo, *fitting(photo, COARSE)), lambda share: None)
-            found = replace(found, coarse=coarse)
-        return found
+        large, longest = photo, max(photo.shape[:2])
+        if longest > WHOLE:
+            photo = resize(photo, *fitting(photo, WHOLE))
+        found = maps_of(photo)
+        if longest > COARSE:
+            found = replace(found, coarse=maps_of(resize(photo, *fitting(photo, COARSE))))
+        report(1.0)
+        return enlarged(found, large) if longest > WHOLE else found
+
+
+@torch.inference_mode()
+def predict(network: torch.nn.Module, batch: Batch) -> Batch:
+    """A network's output for a batch."""
+    out: Batch = network(batch)
+    return out
 
 
 class Corrector:
@@ -114,10 +116,11 @@ class Corrector:
         What is shared by many pixels is judged best at the size of the training: beyond that
         roughness takes its large shades from a step at `COARSE`; albedos' and roughness's large
         shades are the mean of that and of what ``estimate.coarse`` is corrected to; and of a photo
-        larger than `WHOLE` only the large shades are corrected."""
-        if max(photo.shape[:2]) > WHOLE:
-            small, start, few = shrunk(WHOLE, photo, estimate, clipped)
-            return joined(estimate, self(small, renderer, start, few, samples, progress))
+        larger than `WHOLE`, ``estimate.whole`` is corrected, and `enlarged`."""
+        if estimate.whole:
+            small, _, few = shrunk(WHOLE, photo, estimate, clipped)
+            found = self(small, renderer, estimate.whole, few, samples, progress)
+            return enlarged(found, photo)
         if estimate.coarse:
             small, _, few = shrunk(COARSE, photo, estimate, clipped)
             alone = replace(estimate, coarse=None)

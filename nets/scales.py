@@ -1,5 +1,5 @@
-"""An estimate at one size with the large shades of another: what a network was trained to judge at
-small sizes it judges at those."""
+"""Estimates at other sizes: what a network was trained to judge at small sizes it judges at those,
+and the details of a larger photo's maps come from the photo."""
 
 from __future__ import annotations
 
@@ -8,15 +8,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
 
-from invrender.maps import NAMES, Estimate, Maps, resize_maps, unit_normals
+from invrender.maps import Estimate, Maps, resize_maps, unit_normals
 from invrender.refine.lobes import Lobes
 from invrender.sampling import resize
-from invrender.types import Array
+from invrender.types import TINY, Array
 from nets.model import LEAST_MAP_ROUGHNESS
 
 WHOLE = 256  # pixels of the longer side at which a sample is judged as a whole
 COARSE = 128  # pixels of the longer side at which the correction was trained
+# Of the guided filter, by hand: pixels a side of its window; deviation of the photo's logarithm
+# that tells nothing; what is added to the photo before, of its mean; n·z of the steepest normal.
+GUIDE_SIZE, GUIDE_NOISE, DARK, STEEPEST = 5, 0.03, 0.02, 0.1
 
 
 @dataclass(frozen=True)
@@ -25,13 +29,15 @@ class Prediction(Estimate):
 
     unit: the radiance of a white plane under the capture's lights. lobes: what
     `invrender.refine.lobes` found of the photo, at most `WHOLE` pixels a side. coarse: what the
-    network estimates of the photo shrunk to `COARSE`, where it is larger. interrupted: by Ctrl-C,
-    before all passes of the correction were done.
+    network estimates of the photo shrunk to `COARSE`, where it is larger. whole: likewise to
+    `WHOLE`, which `enlarged` to the photo's size this is. interrupted: by Ctrl-C, before all passes
+    of the correction were done.
     """
 
     unit: float
     lobes: Lobes | None = None
     coarse: Prediction | None = None
+    whole: Prediction | None = None
     interrupted: bool = False
 
 
@@ -72,9 +78,47 @@ def shaded(
     return replace(estimate, maps=Maps(diffuse, specular, roughness, normal))
 
 
-def joined(fine: Prediction, whole: Prediction) -> Prediction:
-    """An estimate with the large shades and the expected errors of a coarser one."""
-    sigma = resized(whole.sigma, *fine.maps.shape)
-    return replace(
-        shaded(fine, whole, NAMES), sigma=sigma, lobes=whole.lobes, interrupted=whole.interrupted
+def enlarged(whole: Prediction, photo: Array) -> Prediction:
+    """The estimate of a photo (H, W, 3) from that of the photo shrunk.
+
+    A guided filter (He, Sun, Tang 2013): slopes and albedos are linear in the logarithm of the
+    photo around each small pixel, and what is linear there goes on to the details. Roughness, and
+    expected errors, are interpolated: with the photo they do not vary.
+    """
+    height, width = photo.shape[:2]
+    low = whole.maps.shape
+    dark = DARK * photo.mean((0, 1)) + TINY
+    guide = np.log(np.maximum(photo, 0) + dark).astype(np.float32)
+    small = resize(guide, *low)
+    guide -= resize(small, height, width)  # now what the small one does not show
+    mean = _around(small)
+    spread = _around(small[..., :, None] * small[..., None, :])
+    spread -= mean[..., :, None] * mean[..., None, :]
+    inverse = np.linalg.inv(spread + np.float32(GUIDE_NOISE**2) * np.eye(3, dtype=np.float32))
+
+    def detailed(image: Array) -> Array:
+        out = resize(image, height, width)
+        for k in range(image.shape[-1]):
+            x = image[..., k : k + 1]
+            covariance = _around(small * x) - mean * _around(x)
+            slope = np.einsum("hwij,hwj->hwi", inverse, covariance)
+            out[..., k] += np.einsum("hwi,hwi->hw", resize(_around(slope), height, width), guide)
+        return out
+
+    maps = whole.maps
+    normal = np.ones((height, width, 3), np.float32)
+    normal[..., :2] = detailed(maps.normal[..., :2] / np.maximum(maps.normal[..., 2:], STEEPEST))
+    maps = Maps(
+        np.clip(detailed(maps.diffuse), 0, 1),
+        np.clip(detailed(maps.specular), 0, 1),
+        resize(maps.roughness, height, width),
+        unit_normals(normal),
     )
+    sigma = resized(whole.sigma, height, width)
+    return replace(whole, maps=maps, sigma=sigma, coarse=None, whole=whole)
+
+
+def _around(image: Array) -> Array:
+    """Means over the square around each pixel of (H, W, ...)."""
+    size = (GUIDE_SIZE, GUIDE_SIZE, *(1 for _ in image.shape[2:]))
+    return np.asarray(uniform_filter(image, size, mode="nearest"))

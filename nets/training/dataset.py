@@ -41,9 +41,8 @@ from invrender.tasks import map_tasks
 from invrender.types import Array, InputError
 from nets.batch import lobe_inputs, positions
 from nets.clues import light_inputs, white_level
-from nets.predict import estimate_of, linearised
+from nets.predict import estimate_of, linearised, predict
 from nets.store import load_weights
-from nets.tiles import predict
 from nets.training.draw import (
     SPLITS,
     Options,

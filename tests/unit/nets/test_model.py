@@ -30,7 +30,6 @@ from nets.blocks import NAFBlock, Upsample, pad_to  # noqa: E402
 from nets.model import DIELECTRIC_F0, Network, normalise  # noqa: E402
 from nets.predict import WEIGHTS, Reconstructor  # noqa: E402
 from nets.store import build, load_weights, save_weights  # noqa: E402
-from nets.tiles import _tiles, predict  # noqa: E402
 
 RIG = Rig()
 UNITLESS = ("position", "rig", "lobes", "evidence", "costs")
@@ -466,18 +465,6 @@ def test_inference_without_a_room_or_with_a_bad_photo(reconstructor):
     assert np.isfinite(result.maps.diffuse).all()
     with pytest.raises(InputError, match="photo"):
         reconstructor(np.zeros((8, 8)), Lights(RIG, block_pattern(64)))
-
-
-def test_tiles_cover_and_blend(reconstructor, lights, monkeypatch):
-    monkeypatch.setattr("nets.tiles.TILE_SIZE", 64)
-    monkeypatch.setattr("nets.tiles.OVERLAP", 16)
-    covered = np.zeros((100, 150), int)
-    for rows, columns in _tiles(100, 150):
-        covered[rows, columns] += 1
-    assert covered.min() >= 1
-    out = predict(reconstructor.network, make_batch(lights, 100, 150))
-    assert out["diffuse"].shape == (1, 3, 100, 150)
-    assert all(torch.isfinite(v).all() for v in out.values())
 
 
 def test_rig_in_other_units(lights):
