@@ -1,11 +1,14 @@
 """The paper's evaluation: captures, rows, tables, bars."""
 
+import json
+
 import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
 
 from benchmarks import paper  # noqa: E402
+from benchmarks.baselines import methods  # noqa: E402
 from benchmarks.baselines.flash import SIZE  # noqa: E402
 from benchmarks.common import held_out, perturbed  # noqa: E402
 from invrender.rig import Rig  # noqa: E402
@@ -27,23 +30,25 @@ def row(error, name):
 
 def test_table_pools_squares_and_keeps_the_papers_numbers_apart():
     rows = [row(0.3, "ours"), row(0.4, "ours")]
-    shown, pooled = paper.table_1(rows, {"ours": {"average": 0.0227}})
+    shown, pooled = paper.table_1(rows, {"ours": {"average": 0.0227}}, {"ours": 0.5})
     assert pooled["ours"]["normal"] == pytest.approx(np.sqrt((0.09 + 0.16) / 2))
     assert pooled["ours"]["lpips"] == pytest.approx(0.35)
     line = shown["rows"][0]
-    assert line[0] == paper.ROWS["ours"] and line[-1] == 0.0227
+    assert line[0] == paper.ROWS["ours"] and line[-2:] == [0.5, 0.0227]
+    refined = shown["rows"][list(paper.ROWS).index("ours-refined")]
+    assert refined[-2:] == [0.5, None]
     assert 0.0227 not in line[:-1] and shown["rows"][1][-1] is None
 
 
 def test_bars_compare_equal_budgets():
     rows = [row(0.1, "ours")]
-    _, pooled = paper.table_1(rows, {})
+    _, pooled = paper.table_1(rows, {}, {})
     found = {b["name"]: b for b in paper.bars(pooled, rows)}
     ratio = found["average map RMSE, ours over LPL+ (no clues)"]
     assert ratio["value"] == pytest.approx(0.5) and ratio["ok"]
     assert found["columns in which ours is first"]["value"] == len(paper.COLUMNS)
     assert not found["held-out captures"]["ok"]
-    _, pooled = paper.table_1([row(0.1, "lpl++")], {})
+    _, pooled = paper.table_1([row(0.1, "lpl++")], {}, {})
     found = {b["name"]: b for b in paper.bars(pooled, rows)}
     assert found["columns in which ours is first"]["value"] == 0
 
@@ -81,3 +86,23 @@ def test_a_capture_is_of_its_number_alone():
     assert small.photo.mean() == pytest.approx(a.photo.mean(), rel=1e-4)
     # The photo is near what the believed lights make of the maps.
     assert np.abs(a.photo - a.ideal).mean() < 0.5 * a.ideal.mean()
+
+
+def test_committed_weights_are_small_and_say_how_they_were_trained():
+    files = [methods.weights_of(name) for name in methods.METHODS]
+    assert sum(f.stat().st_size for f in files) <= 6_000_000
+    notes = [methods.training_notes(name) for name in methods.METHODS]
+    assert len({n["captures"] for n in notes}) == len({n["batch"] for n in notes}) == 1
+    minutes = [n["minutes"] for n in notes]
+    assert max(minutes) < 1.1 * min(minutes)
+    for name in methods.METHODS:
+        weights = methods.trained(name).state_dict().values()
+        assert all(torch.isfinite(w).all() for w in weights)
+
+
+@pytest.mark.slow
+def test_quick(tmp_path):
+    paper.main(paper.parser().parse_args(["--out", str(tmp_path), "--quick"]))
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert len(results["rows"]) == 4 and results["bars"] and "Table 1" in results["tables"]
+    assert (tmp_path / "paper.png").is_file() and (tmp_path / "maps_0.png").is_file()
