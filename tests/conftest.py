@@ -5,8 +5,16 @@ Helper modules stand beside this file: `synthetic_photo` (an analytic photograph
 `forward_scenes` (lights and materials of the forward model), `chromium` (a browser).
 """
 
+import os
 import shutil
 from functools import cache
+
+# Workers share the processors. OpenMP's threads wait for each other by spinning: where there are
+# more of them than processors, torch's convolutions take ten times as long and more. Before torch
+# and numpy are loaded; processes that tests start inherit it.
+if workers := os.environ.get("PYTEST_XDIST_WORKER_COUNT"):
+    own = max(1, (os.cpu_count() or 1) // int(workers))
+    os.environ.setdefault("OMP_NUM_THREADS", str(own))
 
 import pytest
 

@@ -94,11 +94,11 @@ def photograph(
     pattern = blocks() if pattern is None else pattern
     centre = rig.ball_centre + np.array([*(ball or (0.0, 0.0)), 0.0])
 
-    def shade(pixels: Any) -> Any:
+    def shade(pixels: Any, with_ball: bool) -> Any:
         ray = rig.rays(pixels, height, width)
         ground = rig.camera - ray * (rig.camera[2] / ray[..., 2:])
         out = table_seen(rig, ground, table, centre if ball is not None else centre + 1e3)
-        if ball is None:
+        if not with_ball:
             return out
         oc = rig.camera - centre
         b = ray @ oc
@@ -117,18 +117,18 @@ def photograph(
         out[hit] = seen * np.asarray(rig.ball_reflectance)
         return out
 
-    def block(y0: int, y1: int, x0: int, x1: int, k: int) -> Any:
+    def block(y0: int, y1: int, x0: int, x1: int, k: int, with_ball: bool) -> Any:
         ys = y0 + (np.arange((y1 - y0) * k) + 0.5) / k
         xs = x0 + (np.arange((x1 - x0) * k) + 0.5) / k
-        image = shade(np.stack(np.broadcast_arrays(xs[None, :], ys[:, None]), -1))
+        image = shade(np.stack(np.broadcast_arrays(xs[None, :], ys[:, None]), -1), with_ball)
         return image.reshape(y1 - y0, k, x1 - x0, k, 3).mean((1, 3))
 
-    image = block(0, height, 0, width, 1)
+    image = block(0, height, 0, width, 1, False)
     if ball is not None:
         x, y = rig.project(centre, height, width)
         r = rig.focal(width) * rig.ball_radius / rig.screen_height * 2.5 + 3
         y0, y1 = max(0, int(y - r)), min(height, int(y + r))
         x0, x1 = max(0, int(x - r)), min(width, int(x + r))
         if y1 > y0 and x1 > x0:
-            image[y0:y1, x0:x1] = block(y0, y1, x0, x1, samples)
+            image[y0:y1, x0:x1] = block(y0, y1, x0, x1, samples, True)
     return image.astype(np.float32)

@@ -255,6 +255,8 @@ class App:
         if folder.is_dir():  # not discarded meanwhile
             failed = {**job, "state": "failed", "problem": problem}
             store.update(folder, job=failed if problem else None)
+            if self.warm and not problem:  # while a person looks at the maps
+                self.start(_quietly(self.quick.run("warm_export")))
 
     def cancel(self, id: str) -> None:
         """Take a capture out of the queue, or end what is being computed."""

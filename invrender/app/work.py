@@ -61,6 +61,15 @@ def warm_check(tell: Tell) -> None:
     import invrender.pattern.guide  # noqa: F401
 
 
+def warm_export(tell: Tell) -> None:
+    """Load and compile what an export needs."""
+    from invrender.export import rerender_error
+    from invrender.maps import constant_maps
+
+    maps = constant_maps(8, 8)
+    rerender_error(maps, maps)
+
+
 def check(tell: Tell, folder: str, number: int) -> dict[str, Any]:
     """Show a photo and what is found in it; returns what ``check.json`` then says.
 

@@ -85,7 +85,8 @@ def with_nan(image):
 
 def without_ball(image):
     h, w = image.shape[:2]
-    image[h // 2 - 60 : h // 2 + 60, w // 2 - 60 : w // 2 + 60] = image[10, 10]
+    r = h // 6
+    image[h // 2 - r : h // 2 + r, w // 2 - r : w // 2 + r] = image[10, 10]
     return image
 
 
@@ -101,8 +102,8 @@ BAD = {
     "NaN": (photo(with_nan), "NaN"),
     "black": (photo(np.zeros_like), "black"),
     "one pixel": (photo(lambda x: x[:1, :1].copy()), "small"),
-    "no ball": (photo(lambda x: without_ball(x[::2, ::2].copy())), "ball"),
-    "ball cut off": (photo(lambda x: x[: x.shape[0] // 2 : 2, ::2].copy()), ""),
+    "no ball": (photo(lambda x: without_ball(x[::4, ::4].copy())), "ball"),
+    "ball cut off": (photo(lambda x: x[: x.shape[0] // 2 : 4, ::4].copy()), ""),
     "negative size": (edit("size = 0.18", "size = -0.18"), "positive"),
     "below the table": (edit("height = 0.153", "height = -0.1"), "above"),
     "unknown key": (edit("size = 0.18", "size = 0.18\ncolour = 3"), "colour"),

@@ -5,6 +5,7 @@ import { state, captureOf, discard } from "./app.js";
 const LINES = [["ball", "ball", "#7be08b"], ["horizon", "horizon in it", "#f2d75c"], ["screen", "screen in it", "#ff7a6b"], ["sample", "sample", "#62c2ff"], ["marker", "sheet's markers", "#ff7df0"]];
 const CORNERS = ["lower left", "lower right", "upper right", "upper left"];
 const DELAY = 700; // ms after the last movement
+const COARSE = matchMedia("(pointer: coarse)"), FINGER = 11; // CSS pixels, a handle's radius under one
 
 export function check(main, id) {
   const off = new Set(), one = captureOf(id);
@@ -12,7 +13,7 @@ export function check(main, id) {
   const stage = h("div.stage-photo"), side = h("div.stack"), tabs = h("div"), title = h("h1", {}, one.name);
   const legend = h("div.legend", {}, [...LINES, ["clipped", "saturated", "#ff3c3c"]].map(([key, label, colour]) => {
     const mark = h("i"); mark.style.borderColor = colour;
-    return h("label", {}, h("input", { type: "checkbox", checked: true, onchange: (e) => { if (e.target.checked) off.delete(key); else off.add(key); draw(); } }), mark, label);
+    return h("label", { "data-line": key }, h("input", { type: "checkbox", checked: true, onchange: (e) => { if (e.target.checked) off.delete(key); else off.add(key); draw(); } }), mark, label);
   }));
   main.append(title, tabs, h("div.split", {}, h("div", {}, stage, legend), h("aside.sheet.stack", {}, side)));
   const size = h("select", { id: "size" }, state.sizes.map((s) => h("option", { value: String(s) }, `${s} × ${s} pixels`)));
@@ -48,6 +49,7 @@ export function check(main, id) {
         shownAt = a.shown;
       }
       stage.querySelector(".clipped").hidden = off.has("clipped");
+      for (const label of legend.children) label.hidden = { marker: !a.markers?.length, clipped: !a.clipped }[label.dataset.line] || false;
       lines(a);
     }
     drawSide();
@@ -61,7 +63,8 @@ export function check(main, id) {
       if (off.has(name) || name === "sample" || !a.outlines?.[name]) continue;
       overlay.append(svg("polygon", { class: `line ${name}`, points: a.outlines[name].map((p) => p.join(",")).join(" ") }));
     }
-    const corners = (a.corners || []).map((c) => [...c]), [w, ht] = a.size, r = Math.max(w, ht) / 110;
+    const corners = (a.corners || []).map((c) => [...c]), [w, ht] = a.size;
+    const r = Math.max(Math.max(w, ht) / 110, COARSE.matches ? FINGER * w / (stage.clientWidth || w) : 0);
     const ball = a.ball ? [...a.ball] : a.problem ? [w / 2, ht / 2, Math.min(w, ht) / 18] : null;
     const known = a.fix || {};
     const now = () => ({ ...known, turn: a.turn || 0, ...(moved.ball ? { ball } : {}), ...(moved.corners ? { corners } : {}) });

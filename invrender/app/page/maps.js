@@ -103,7 +103,7 @@ function relight(panel, c) {
     h("div.stack", {}, buttons("shape", ["plane", "sphere", "cylinder", "cloth"], "plane"), buttons("show", ["material", ...MAPS.map((m) => m[0])], "material"),
       h("div.field", {}, h("label", { for: "rooms" }, "Room"), rooms),
       h("div", {}, SLIDERS.map(([key, label, low, high, step, unit]) => h("div.slider", {}, h("label", { for: key }, label), h("input", { type: "range", id: key, min: low, max: high, step, "data-unit": unit }), h("output", { for: key })))),
-      h("p.small.soft", {}, "Drag to move the lamp; with shift or the right button, to turn the object."))));
+      h("p.small.soft", {}, "Drag to move the lamp; with shift, the right button or a second finger, to turn the object."))));
   let viewer = null, gone = false, captured = null, others = null;
   attempt(async () => {
     const data = await api(`/captures/${c.id}/viewer.json?${c.report.made}`);

@@ -59,7 +59,7 @@ export function photo(main) {
     accept: "image/*,.dng,.cr2,.cr3,.nef,.arw,.raf,.orf,.rw2,.pef,.exr,.hdr,.heic,.tif,.tiff",
     onchange: () => { const files = [...input.files]; input.value = ""; add(files); } });
   const drop = h("div.drop", {},
-    h("b", {}, "Drop photos here"), h("span.soft", {}, "Raw is best; HEIC, JPEG, PNG, TIFF and EXR are fine."),
+    h("b.drops", {}, "Drop photos here"), h("span.soft", {}, "Raw is best; HEIC, JPEG, PNG, TIFF and EXR are fine."),
     h("label.button.primary", { for: "file" }, "Choose photos"), input,
     h("button.plain", { type: "button", id: "use-example", onclick: (e) => attempt(example, e.target) }, "Use the example photo"));
   for (const kind of ["dragenter", "dragover"]) drop.addEventListener(kind, (e) => { e.preventDefault(); drop.classList.add("over"); });
@@ -69,7 +69,7 @@ export function photo(main) {
     h("div.split", {}, h("div.stack", {}, patterns, drop, list),
       h("aside.sheet.stack", {}, state.links.phone
         ? h("div.qr", {}, h("img", { src: "/qr/phone.svg", alt: "QR code of this page" }), h("p", {}, "Scan it with the phone: this page opens there, and takes its photos."))
-        : h("p.soft", {}, "Started as ", h("code", {}, "invrender app --lan"), ", the program shows a QR code here that opens this page on the phone."),
+        : h("p.soft", {}, "Started as ", h("code.command", {}, "invrender app --lan"), ", the program shows a QR code here that opens this page on the phone."),
       h("div", {}, h("h2", {}, "A good photo"), h("ul", {}, ["24 mm lens, no zoom, no flash, no filters", "focus on the sample, and lock it", "hands and head out of the ball's view", "a dim room is better than a bright one"].map((t) => h("li", {}, t)))))));
   const draw = chooser(patterns);
   draw();

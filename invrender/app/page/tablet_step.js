@@ -22,7 +22,7 @@ export function tablet(main) {
   const tablet = state.links.tablet
     ? h("div.qr", {}, h("img", { src: "/qr/tablet.svg", alt: "QR code of the pattern's page" }), h("p", {}, "Scan it with the tablet's camera. The pattern's page opens."))
     : h("div.stack", {}, h("h2", {}, "Is the tablet another device?"),
-      h("p", {}, "Start the program as ", h("code", {}, "invrender app --lan"), ": then a QR code here opens the pattern on the tablet, and another one this page on the phone. It opens the port to your network, guarded by the key in the code, but not encrypted."),
+      h("p", {}, "Start the program as ", h("code.command", {}, "invrender app --lan"), ": then a QR code here opens the pattern on the tablet, and another one this page on the phone. It opens the port to your network, guarded by the key in the code, but not encrypted."),
       h("p.soft", {}, "Or open the pattern on this machine's own display:"));
   main.append(h("h1", {}, "Tablet"), h("p.lead", {}, "It shows a light pattern at its real size, mirrored, since the sample looks at it from below."),
     h("div.split", {},
@@ -30,7 +30,7 @@ export function tablet(main) {
         h("li", {}, "Open the pattern's page on the tablet."),
         h("li", {}, "Full brightness. Switch off automatic brightness, night light and tone adaptation."),
         h("li", {}, "Touch “Show the pattern”: full screen, and it stays awake where the browser allows."),
-        h("li", {}, `Turn the tablet face down, ${chosen().height} mm above the table.`)),
+        h("li", {}, `Turn the tablet face down, ${chosen().height}\u00a0mm above the table.`)),
         patterns,
         h("div.actions", {}, h("a.button.primary", { href: "#/photo", id: "tablet-next" }, "Continue"))),
       h("aside.sheet", {}, tablet,

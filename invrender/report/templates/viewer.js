@@ -256,13 +256,13 @@ function startViewer(data) {
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
     canvas.addEventListener("pointerdown", (event) => {
       canvas.setPointerCapture(event.pointerId);
-      const turning = event.button === 2 || event.shiftKey;
-      drag = { turning, x: event.clientX, y: event.clientY, turn: [...state.turn] };
+      const turning = event.button === 2 || event.shiftKey || !event.isPrimary;  // or a second finger
+      drag = { turning, finger: event.pointerId, x: event.clientX, y: event.clientY, turn: [...state.turn] };
       if (!turning) state.lamp = place(event);
       redraw();
     });
     canvas.addEventListener("pointermove", (event) => {
-      if (!drag) return;
+      if (drag?.finger !== event.pointerId) return;
       if (drag.turning) {
         const limit = state.shape === "plane" ? 1.3 : Math.PI;
         const clamp = (a, b) => Math.min(Math.max(a, -b), b), k = 4 / canvas.clientWidth;
