@@ -4,7 +4,7 @@ import { captureOf, discard } from "./app.js";
 
 const MAPS = [["diffuse", "Diffuse albedo"], ["specular", "Specular albedo"], ["roughness", "Roughness"], ["normal", "Normal"]];
 const STAGES = { lights: "Reading the light from the ball", preview: "A first, quick look", crop: "Cutting out the sample", read: "Loading the networks", "forward model": "Preparing the renderer", "initial maps": "The networks' first maps", refine: "Refining against the photo", render: "Rendering", write: "Writing" };
-const SLIDERS = [["power", "Lamp", 0, 3, 0.05, ""], ["room", "Room", 0, 3, 0.05, ""], ["angle", "Turn room", -180, 180, 1, "°"], ["exposure", "Exposure", -4, 4, 0.1, " EV"]];
+const SLIDERS = [["power", "Lamp", 0, 3, 0.05, " ×"], ["room", "Room", 0, 3, 0.05, " ×"], ["angle", "Turn room", -180, 180, 1, "°"], ["exposure", "Exposure", -4, 4, 0.1, " EV"]];
 const ZOOM = 4;
 
 export function maps(main, id) {
@@ -141,7 +141,7 @@ function flat(panel, c) {
   set();
   panel.append(h("div.maps2", {}, all.map((m) => m.figure)),
     h("div.slider.wide", {}, h("label", { for: "sure" }, "Expected error"), shade),
-    h("p.small.soft", {}, "The slider lays the expected error over each map: dark is certain, bright yellow is ± 0.2 or more, a guess."));
+    h("p.small.soft", {}, "The slider lays the expected error over each map: dark is certain, bright yellow is ± 0.2 or more of a range of 1, a guess."));
   return null;
 }
 

@@ -44,7 +44,7 @@ export function take(main, id) {
     pictures.replaceChildren(h("div.pair", {}, picture("repeated", "Repeated as it is", `Steps at the border are ${t.seams.before.toFixed(1)} times those inside.`),
       picture("tile", "Seamless", `${t.seams.after.toFixed(1)} times; ${percent(t.seams.replaced)} of the pixels come from elsewhere in the sample.`),
       picture("height", "Height", `From black to white ${(1000 * t.span).toPrecision(2)} mm; no surface explains ${percent(t.outliers, 1)} of the slopes.`)));
-  }, preview) }, "Preview");
+  }, preview) }, "Preview seamless and height");
   main.append(h("h1", {}, `Take “${c.name}” away`), h("p.lead", {}, "Every file knows its colour space and its size in metres. What the conversion costs is measured as it is written."),
     h("div.sheet.stack", {}, h("div.fields", {},
       h("div", {}, h("label.check", { for: "tileable" }, tileable, "Seamless, to be repeated"), h("label.check", { for: "height" }, height, "With height and ambient occlusion")),
