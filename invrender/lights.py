@@ -60,11 +60,19 @@ class Lights:
         gain = np.broadcast_to(np.asarray(self.gain, np.float32), 3) * screen
         return replace(self, gain=gain, environment=self.environment * room)
 
-    def turned(self, quarters: int) -> Lights:
-        """Seen from a sample that is turned clockwise: all turned counter-clockwise by quarters
-        about its normal. For the forward model alone: the ball stays, and so does ``coverage``."""
-        if quarters % 4 == 0:
-            return self
-        turn = Rotation.from_rotvec([0, 0, 90 * quarters], degrees=True)
-        room = rotate_environment(self.environment, quarters % 4 * np.pi / 2)
-        return replace(self, rig=self.rig.turned(turn, np.zeros(3)), environment=room)
+    def placed(self, place: Array) -> Lights:
+        """Seen from a sample that lies elsewhere: where the homography ``place`` (3, 3) takes the
+        square of the sample, [-1, 1]², x right and y up; its shift and its turn count. For the
+        forward model alone: the ball stays, and so does ``coverage``."""
+        angle = float(np.arctan2(place[1, 0], place[0, 0]))
+        turn = Rotation.from_rotvec([0, 0, -angle])
+        half = self.rig.sample_size / 2
+        by = turn.apply([*(-half * place[:2, 2] / place[2, 2]), 0.0])
+        rig = self.rig.turned(turn, np.zeros(3))
+        rig = replace(
+            rig,
+            screen_shift=tuple(np.add(rig.screen_shift, by).tolist()),
+            camera_shift=tuple(np.add(rig.camera_shift, by).tolist()),
+        )
+        room = rotate_environment(self.environment, -angle % (2 * np.pi)) if angle else None
+        return replace(self, rig=rig, environment=self.environment if room is None else room)

@@ -14,13 +14,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from invrender.capture.crop import crop_mask, crop_sample
+from invrender.capture.crop import crop_mask, crop_part, crop_sample
 from invrender.capture.lights import FoundLights, find_lights
+from invrender.capture.placement import find_place
 from invrender.capture.which_pattern import find_pattern
 from invrender.files.capture import Capture, load_capture, load_set, set_patterns
+from invrender.files.images import Photo
 from invrender.files.output import check_output
 from invrender.lights import Lights
-from invrender.maps import Estimate, Maps, map_errors, resize_maps, turn_maps
+from invrender.maps import Estimate, Maps, map_errors, resize_maps
 from invrender.pattern.default import default_pattern
 from invrender.report.notices import map_notices
 from invrender.report.report import Report
@@ -29,6 +31,7 @@ from invrender.types import Array, InputError, Mask, Notice
 
 if TYPE_CHECKING:  # Dr.Jit compiles where the refinement is imported
     from invrender.refine.gauss_newton import Observation, Refined
+    from invrender.refine.registration import Registered
     from nets.predict import Corrector, Reconstructor
 
     Networks = tuple[Reconstructor, Corrector]
@@ -37,6 +40,7 @@ if TYPE_CHECKING:  # Dr.Jit compiles where the refinement is imported
 MEGABYTES = 200e-6, 8  # of a result: a pixel, and for the rest
 FINE = 256  # pixels a side up to which a kept rendering takes `SAMPLES`; its cost grows with them
 ASKED = 2  # photos of several whose maps networks estimate
+STRAIGHT = 10.0  # degrees up to which networks read a turned sample
 MEASURING_PHOTOS = 3  # photos from which these count for more than what networks know
 
 
@@ -61,32 +65,45 @@ class Stages:
 
 @dataclass(frozen=True)
 class Sample:
-    """A sample as a photo shows it: photo (N, N, 3), linear radiance; clipped (N, N), where it is
-    saturated; lights, what it was photographed under."""
+    """A sample as a photo shows it: photo (N, N, 3), linear radiance; clipped (N, N), where it does
+    not measure the sample; lights, what it was photographed under; whole, the photo that it is cut
+    from, if any; place, where the first photo's square of several lies in this one's own."""
 
     photo: Array
     clipped: Mask
     lights: Lights
+    whole: Photo | None = None
+    place: Array | None = None
 
     @classmethod
-    def of(cls, found: FoundLights, size: int) -> Sample:
-        """Cut out of a capture's photo, ``size`` pixels a side."""
+    def of(cls, found: FoundLights, size: int, whole: bool = False) -> Sample:
+        """Cut out of a capture's photo, ``size`` pixels a side; whole: to be registered, so that
+        the photo is kept."""
         if size < 1:
             raise InputError(f"the size must be at least one pixel, got {size}")
         photo, rig = found.capture.photo, found.lights.rig
         crop, clipped = crop_sample(photo, rig, size), crop_mask(photo, rig, size)
-        return cls(crop, clipped, found.lights)
+        return cls(crop, clipped, found.lights, photo if whole else None)
 
-    def observation(self, turn: int = 0) -> Observation:
-        """With its forward model, turned counter-clockwise by quarters."""
+    def placed(self, place: Array) -> Sample:
+        """The square of the sample that lies where a homography takes this one's own, with the
+        lights as they are seen from there."""
+        if self.whole is None or np.array_equal(place, np.eye(3)):
+            return self
+        rig, size = self.lights.rig, len(self.photo)
+        crop = crop_part(self.whole, rig, size, place)
+        clipped = crop_mask(self.whole, rig, size, place)
+        return Sample(crop, clipped, self.lights.placed(place), None, place)
+
+    def observation(self) -> Observation:
+        """With its forward model."""
         from invrender.refine.gauss_newton import Observation
         from invrender.refine.shared import light_doubt
         from invrender.render.fast.estimator import Fast
 
-        photo = np.ascontiguousarray(np.rot90(self.photo, turn))
-        clipped = np.rot90(self.clipped, turn) if self.clipped.any() else None
+        clipped = self.clipped if self.clipped.any() else None
         doubt = light_doubt(self.lights.fit)
-        return Observation(photo, Fast.under(self.lights.turned(turn)), clipped, doubt)
+        return Observation(self.photo, Fast.under(self.lights), clipped, doubt)
 
 
 def refine_capture(
@@ -139,14 +156,16 @@ def prepare(
     folders: Sequence[Path], known: dict[str, Any], size: int, stage: Stages | None = None
 ) -> Prepared:
     """The lights of the folders' captures, and the sample as each photo shows it, ``size`` pixels a
-    side; the photos themselves are no longer needed, and left out. known: of `find_lights`."""
+    side; a photo alone is no longer needed then, and left out. known: of `find_lights`."""
     stage = stage or Stages()
     with stage("read"):
         read = [_read(f) for f in folders]
     with stage("lights"):
         found = _find_all([(c, p) for captures, p in read for c in captures], known, stage)
     with stage("crop"):
-        return [_without_photo(f) for f in found], [Sample.of(f, size) for f in found]
+        return [_without_photo(f) for f in found], [
+            Sample.of(f, size, len(found) > 1) for f in found
+        ]
 
 
 def _without_photo(found: FoundLights) -> FoundLights:
@@ -235,7 +254,7 @@ def reconstruct(
     every = [found] if isinstance(found, FoundLights) else list(found)
     stage = Stages(progress)
     with stage("crop"):
-        crops = [Sample.of(f, size) for f in every]
+        crops = [Sample.of(f, size, len(every) > 1) for f in every]
     with stage("read"):
         networks = load_networks(init)
     return _reconstruct(every, crops, networks, stage, size, init, samples)
@@ -342,30 +361,36 @@ def estimate_maps(
         from invrender.refine.mirrors import take_mirrors
         from invrender.refine.posterior import explain
         from invrender.refine.priors import lobe_prior, network_prior, pooled
-        from invrender.refine.several import by_pattern, explain_together, find_turn, likeliest
+        from invrender.refine.registration import register
+        from invrender.refine.several import by_pattern, explain_together, likeliest
         from invrender.refine.shared import share
         from invrender.refine.theta import to_maps
 
+    measured = len(crops) >= MEASURING_PHOTOS
+    own, free = crops, len(crops) > 1 and any(c.place is None for c in crops)
+    if free:
+        with stage("registration"):
+            crops = [own[0], *(c.placed(find_sample(c, own[0])) for c in own[1:])]
+    with stage("forward model"):
         photos = [c.observation() for c in crops]
-    several, measured = len(crops) > 1, len(crops) >= MEASURING_PHOTOS
-    if several or init == "flat":
+    if init == "flat":
         with stage("initial maps"):
-            flat = [flat_maps(p.photo, p.renderer, samples) for p in photos]
-    turns = [0] + [find_turn(m, flat[0]) for m in flat[1:]] if several else [0]
+            start = flat_maps(photos[0].photo, photos[0].renderer, samples)
     interrupted = False
     if init == "flat":
-        start = flat[0]
         with stage("materials"):
             prior = lobe_prior(fit_lobes(photos[0].photo, photos[0].renderer, samples))
     else:
         assert networks is not None
         reconstruct, improve = networks
-        # What networks know of a sample they tell from the photos whose pattern they know best.
-        asked = by_pattern([c.lights.pattern for c in crops], default_pattern())[:ASKED]
+        # What networks know of a sample they tell from the photos whose pattern they know best,
+        # and in which it is not turned.
+        asked = by_pattern([c.lights.pattern for c in crops], default_pattern())
+        asked = [i for i in asked if _is_straight(crops[i])][:ASKED]
         with stage("initial maps"):
             told = stage.part("initial maps")
             estimates = [reconstruct(crops[i].photo, crops[i].lights, told) for i in asked]
-        start = turn_maps(estimates[0].maps, -turns[asked[0]])
+        start = estimates[0].maps
         lobes = estimates[0].lobes if len(photos) == 1 else None
         with stage("refine"):
             told = stage.part("refine")
@@ -375,19 +400,11 @@ def estimate_maps(
                 interrupted = estimates[k].interrupted
                 if interrupted:
                     break
-        priors = [
-            network_prior(
-                turn_maps(e.maps, -turns[i]),
-                {n: np.rot90(x, -turns[i]) for n, x in e.sigma.items()},
-            )
-            for e, i in zip(estimates, asked, strict=True)
-        ]
+        priors = [network_prior(e.maps, e.sigma) for e in estimates]
         prior = pooled(priors)
-    with stage("forward model"):
-        photos = [
-            photo if k == 0 else c.observation(-k)
-            for photo, c, k in zip(photos, crops, turns, strict=True)
-        ]
+    if measured and free and not interrupted:
+        with stage("registration"):
+            photos = _registered(photos, own, crops, register(photos, prior.mean))
     with stage("refine"):
         if interrupted:
             result = Refined(to_maps(prior.mean), prior.expected, interrupted=True)
@@ -413,6 +430,38 @@ def estimate_maps(
                 result.converged &= known.converged
             result.factors = known.factors
     return start, result, photos
+
+
+def find_sample(sample: Sample, first: Sample) -> Array:
+    """Where a photo shows the square of the sample that the first one shows, (3, 3)."""
+    if sample.whole is None or first.whole is None:
+        return np.eye(3)
+    photos, rigs = (sample.whole, first.whole), (sample.lights.rig, first.lights.rig)
+    return find_place(photos, rigs)[0]
+
+
+def _is_straight(sample: Sample) -> bool:
+    """Whether the sample lies as in the first photo, by and large."""
+    place = np.eye(3) if sample.place is None else sample.place
+    return bool(abs(np.degrees(np.arctan2(place[1, 0], place[0, 0]))) < STRAIGHT)
+
+
+def _registered(
+    photos: Sequence[Observation], own: Sequence[Sample], crops: Sequence[Sample], found: Registered
+) -> list[Observation]:
+    """The photos cut out again where they were found, their factors divided out."""
+    from invrender.refine.registration import factor_image
+
+    result = []
+    for photo, sample, crop, place, factor in zip(
+        photos, own, crops, found.places, found.factors, strict=True
+    ):
+        before = np.eye(3) if crop.place is None else crop.place
+        again = sample.placed(before @ place)
+        shown = again.photo / factor_image(factor, *again.photo.shape[:2])
+        clipped = again.clipped if again.clipped.any() else None
+        result.append(replace(photo, photo=shown, clipped=clipped))
+    return result
 
 
 def _capture_fit(found: FoundLights) -> dict[str, Any]:

@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from invrender.capture.settings import CROP
 from invrender.files.images import Photo
 from invrender.rig import Rig
-from invrender.types import Array, InputError
+from invrender.types import Array, InputError, Mask
 
 
 def crop_sample(photo: Photo, rig: Rig, size: int = 256) -> Array:
@@ -21,19 +20,28 @@ def crop_sample(photo: Photo, rig: Rig, size: int = 256) -> Array:
     interpolated by cubic splines where it is coarser. Raises `InputError` if the sample is not
     whole in the photo.
     """
+    sample_corners(photo, rig)
+    return crop_part(photo, rig, size)
+
+
+def crop_part(photo: Photo, rig: Rig, size: int, place: Array | None = None) -> Array:
+    """As `crop_sample`, of another part of the table: where the homography ``place`` (3, 3) takes
+    the sample's square, [-1, 1]², x right and y up. What is beyond the photo is its border.
+    """
     if size < 1:
         raise InputError(f"the sample's size must be at least one pixel, got {size}")
     h, w = photo.height, photo.width
-    corners = sample_corners(photo, rig)
+    corners = rig.project(_placed(rig.sample_corners, rig, place), h, w)
     low, high = corners.min(0), corners.max(0)
-    x0, y0 = np.maximum(np.floor(low).astype(int) - CROP.margin, 0)
-    x1, y1 = np.minimum(np.ceil(high).astype(int) + CROP.margin, [w, h])
+    x0, y0 = np.clip(np.floor(low).astype(int) - CROP.margin, 0, [w - 1, h - 1])
+    x1, y1 = np.clip(np.ceil(high).astype(int) + CROP.margin, 1, [w, h])
     crop = photo.image[y0:y1, x0:x1]
     scale = float((high - low).max()) / size  # photo pixels in one of the crop's
     samples = min(max(1, math.ceil(scale)), CROP.samples)
     wide = 2 * round((scale / samples - 1) / 2) + 1  # odd, so that nothing moves
     order = 3 if scale < CROP.spline_scale else 1  # the mean over many pixels needs no splines
-    pixels = rig.project(rig.sample_points(size * samples, size * samples), h, w)
+    points = _placed(rig.sample_points(size * samples, size * samples), rig, place)
+    pixels = rig.project(points, h, w)
     at = np.stack([pixels[..., 1] - y0 - 0.5, pixels[..., 0] - x0 - 0.5])
     planes = []
     for c in range(3):
@@ -45,17 +53,40 @@ def crop_sample(photo: Photo, rig: Rig, size: int = 256) -> Array:
     return np.maximum(np.stack(planes, -1), 0).astype(np.float32)
 
 
-def crop_mask(photo: Photo, rig: Rig, size: int) -> NDArray[np.bool_]:
-    """(size, size): pixels of the sample's crop that a saturated photo pixel touches."""
-    corners = sample_corners(photo, rig)
+def _placed(points: Array, rig: Rig, place: Array | None) -> Array:
+    """Points (..., 3) of the table where a homography of the sample's square takes them."""
+    if place is None:
+        return points
+    half = rig.sample_size / 2
+    moved = np.concatenate([points[..., :2] / half, np.ones_like(points[..., :1])], -1) @ place.T
+    return np.concatenate([moved[..., :2] / moved[..., 2:] * half, points[..., 2:]], -1)
+
+
+def in_photo(photo: Photo, rig: Rig, size: int, place: Array) -> Mask:
+    """(size, size): which pixels of `crop_part` the photo shows."""
+    pixels = rig.project(
+        _placed(rig.sample_points(size, size), rig, place), photo.height, photo.width
+    )
+    inside = (pixels > 0) & (pixels < [photo.width, photo.height])  # NaN is not
+    return np.asarray(inside.all(-1))
+
+
+def crop_mask(photo: Photo, rig: Rig, size: int, place: Array | None = None) -> Mask:
+    """(size, size): pixels of `crop_part` that a saturated photo pixel touches, or that lie outside
+    of the photo's own square of the sample."""
+    outside = np.zeros((size, size), bool)
+    if place is not None:
+        points = _placed(rig.sample_points(size, size), rig, place)
+        outside = (np.abs(points[..., :2]) > rig.sample_size / 2 * CROP.beyond).any(-1)
+    corners = rig.project(_placed(rig.sample_corners, rig, place), photo.height, photo.width)
     x0, y0 = np.maximum(np.floor(corners.min(0)).astype(int) - CROP.mask_margin, 0)
-    x1, y1 = np.ceil(corners.max(0)).astype(int) + CROP.mask_margin
+    x1, y1 = np.maximum(np.ceil(corners.max(0)).astype(int) + CROP.mask_margin, 0)
     clipped = photo.clipped
     if not clipped[y0:y1, x0:x1].any():
-        return np.zeros((size, size), bool)
+        return outside
     mask = np.zeros((*clipped.shape, 3), np.float32)
     mask[y0:y1, x0:x1] = ndimage.maximum_filter(clipped[y0:y1, x0:x1], 3)[..., None]
-    return crop_sample(Photo(mask), rig, size)[..., 0] > CROP.touched
+    return outside | (crop_part(Photo(mask), rig, size, place)[..., 0] > CROP.touched)
 
 
 def sample_corners(photo: Photo, rig: Rig) -> Array:

@@ -533,6 +533,7 @@ class Crop:
     spline_scale: float = 2.0  # photo pixels in a pixel, below which splines are used; by hand
     touched: float = 0.05  # share of saturated pixels in one that counts as saturated; by hand
     tolerance: float = 0.5  # pixels that the sample may reach beyond the photo; by hand
+    beyond: float = 1.01  # halves of the side, of what another photo shows; by hand
 
 
 DAMPED_STEPS = DampedSteps()

@@ -17,7 +17,6 @@ from invrender.refine.gauss_newton import Observation, linearise, refine
 from invrender.refine.lobes import fit_lobes, read_lobes
 from invrender.refine.posterior import explain
 from invrender.refine.priors import Prior, lobe_prior, network_prior, pooled
-from invrender.refine.several import find_turn
 from invrender.refine.theta import MIN_FITTED_ROUGHNESS, to_maps, to_theta
 from invrender.render.fast.estimator import Fast
 from invrender.render.scene import make_scene
@@ -223,7 +222,8 @@ def test_two_photos_tell_more_than_one(renderer, environment):
     truth = procedural_material(5, SIZE, SIZE, kind="leather")
     other = PATTERN[::-1, :, ::-1].copy()
     photo = Fast(make_scene(RIG, other, environment, GAIN)).render(turn_maps(truth, 1))
-    turned = Lights(RIG, other, environment, GAIN).turned(-1)
+    quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    turned = Lights(RIG, other, environment, GAIN).placed(quarter)
     shots = [
         Observation(photo_of(truth, environment), renderer),
         Observation(np.ascontiguousarray(np.rot90(photo, -1)), Fast.under(turned)),
@@ -249,14 +249,6 @@ def test_pooled_priors_weigh_by_precision():
     both = pooled(priors)
     assert both.mean[..., 0] == pytest.approx(0.2 + 0.3 * 0.2)  # weights 4 : 1
     assert (both.sigma[..., 0] > 0.01).all() and (both.sigma[..., 0] < 0.02).all()
-
-
-def test_turn_is_found():
-    maps = procedural_material(2, 64, 64, kind="bricks")
-    for k in range(4):
-        assert find_turn(turn_maps(maps, k), maps) == k
-    plain = constant_maps(8, 8)
-    assert find_turn(plain, plain) == 0
 
 
 def test_bands_give_what_the_whole_gives(renderer, environment, monkeypatch):

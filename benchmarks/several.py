@@ -1,0 +1,287 @@
+"""Several photos of one sample: their error over one photo's, and where the rest comes from.
+
+Path-traced photographs of held-out materials under the patterns of a set, one after another; a hand
+moves camera and display before each. The first 1, 2, 3, 5 and 8 of them are explained together,
+with the lights that the ball shows and registered by the photos ("found"), with these lights at the
+true places ("true places"), and with the true lights at the true places ("true lights").
+
+Photographs are kept in DIR/captures. Without folders, and with --quick, materials and rooms are
+procedural.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import ndimage
+
+from benchmarks.common.captures import (
+    GAIN,
+    SHIFT,
+    TILT,
+    CaptureSet,
+    arguments,
+    sample_and_room,
+    true_lights,
+)
+from benchmarks.common.results import Bar, Table, bar, table, write_results
+from benchmarks.refine import rerender_error
+from invrender.capture.lights import FoundLights, find_lights
+from invrender.capture.which_pattern import find_pattern
+from invrender.data.simulate_setup import hides
+from invrender.files.capture import Capture, load_capture
+from invrender.files.maps import write_maps
+from invrender.files.rig_toml import read_rig, write_rig
+from invrender.files.write import write_exr
+from invrender.lights import Lights
+from invrender.maps import NAMES, Maps, crop_maps, map_errors, resize_maps
+from invrender.pattern.sets import COUNTS, pattern_set
+from invrender.pipeline import Sample, Stages, estimate_maps
+from invrender.rig import Rig
+from invrender.types import Array, InputError, Vec3
+
+SEVERAL = CaptureSet("holdout", 390_000)
+NUMBERS = (1, *COUNTS)
+CAMERA_SHIFT, CAMERA_TILT = 2e-3, 1.0  # standard deviations, metres and degrees, of a hand
+NOISE = 0.005  # of the sensor
+SAMPLES, FINER = 256, 3  # of a texel; a side of a photo pixel, of texels
+WHOLE = 0.95  # of a row or column, that is the sample
+KINDS = (*NAMES, "average", "rerender")
+FOUND, PLACED, TRUE = STAGES = ("found", "true places", "true lights")
+RATIOS = {"normal": 0.45, "diffuse": 0.5, "roughness": 0.75, "average": 0.6, "rerender": 0.5}
+OF_A_SET = 5  # photos, whose errors the bars are for
+
+Row = dict[str, Any]
+
+
+def hand_held(rng: np.random.Generator) -> Rig:
+    """The default rig as a hand holds it, the display beside the camera's view."""
+
+    def drawn(deviation: float) -> Vec3:
+        x = np.clip(rng.normal(0, deviation, 3), -2 * deviation, 2 * deviation)
+        return float(x[0]), float(x[1]), float(x[2])
+
+    while True:
+        rig = Rig(
+            screen_shift=drawn(SHIFT), screen_tilt=drawn(TILT),
+            camera_shift=drawn(CAMERA_SHIFT), camera_tilt=drawn(CAMERA_TILT),
+        )  # fmt: skip
+        if not hides(rig):
+            return rig
+
+
+def photograph_set(rig: Rig, maps: Maps, lights: Lights, width: int, spp: int, seed: int) -> Array:
+    """A photo (H, W, 3): ball and table path-traced, the sample's pixels from the fast estimator at
+    the maps' own resolution, since a path tracer's noise there would be that of a bad sensor."""
+    from invrender.render.fast.estimator import Fast
+    from invrender.render.path_traced import photograph
+    from invrender.render.scene import scene_under
+
+    height = width * 3 // 4
+    photo = photograph(
+        rig, maps, lights.pattern, lights.environment, lights.gain,
+        height=height, width=width, spp=spp, seed=seed,
+    )  # fmt: skip
+    shown = Fast(scene_under(lights), detail=2).render(maps, SAMPLES)
+    corners = rig.project(rig.sample_corners, height, width)
+    (x0, y0), (x1, y1) = np.floor(corners.min(0)).astype(int), np.ceil(corners.max(0)).astype(int)
+    part = (np.arange(FINER) + 0.5) / FINER
+    x = (np.arange(x0, x1)[:, None] + part).ravel()
+    y = (np.arange(y0, y1)[:, None] + part).ravel()
+    rays = rig.rays(np.stack(np.meshgrid(x, y), -1), height, width)
+    at = (rig.camera - rays * (rig.camera[2] / rays[..., 2:]))[..., :2] / rig.sample_size + 0.5
+    h, w = maps.shape
+    row, column = np.floor((1 - at[..., 1]) * h).astype(int), np.floor(at[..., 0] * w).astype(int)
+    inside = (row >= 0) & (row < h) & (column >= 0) & (column < w)
+    fine = photo[y0:y1, x0:x1].repeat(FINER, 0).repeat(FINER, 1)
+    fine[inside] = shown[row[inside], column[inside]]
+    photo[y0:y1, x0:x1] = fine.reshape(y1 - y0, FINER, x1 - x0, FINER, 3).mean((1, 3))
+    rng = np.random.default_rng(seed)
+    sigma = NOISE * np.sqrt(np.maximum(photo, 0) * float(np.percentile(photo, 99)))
+    return np.maximum(photo + sigma * rng.standard_normal(photo.shape), 0)
+
+
+def make_sets(
+    out: Path, count: int, photos: int, size: int, width: int, spp: int,
+    materials: Path | None, rooms: Path | None,
+) -> list[list[Path]]:  # fmt: skip
+    """Captures ``out``/000/1 and so on, a photo each; simulates those that are not there yet."""
+    patterns = pattern_set(max(COUNTS))
+    sets = [[out / f"{k:03d}" / str(i + 1) for i in range(photos)] for k in range(count)]
+    for k, folders in enumerate(sets):
+        maps, room, _ = sample_and_room(k, SEVERAL, size, materials, rooms)
+        for i, folder in enumerate(folders):
+            if folder.exists():
+                continue
+            rig = hand_held(np.random.default_rng((SEVERAL.first_seed, k, i)))
+            lights = Lights(rig, patterns[i], room, GAIN)
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".") as name:
+                new = Path(name) / "capture"
+                (new / "truth").mkdir(parents=True)
+                photo = photograph_set(rig, maps, lights, width, spp, 8 * k + i)
+                write_exr(new / "photo.exr", photo, half=True)
+                write_exr(new / "pattern.exr", patterns[i], half=True)
+                write_rig(new / "rig.toml", Rig(), "pattern.exr", "truth/")
+                write_rig(new / "truth" / "rig.toml", rig)
+                write_maps(new / "truth", maps, half=True, width=rig.sample_size)
+                write_exr(new / "truth" / "environment.exr", room, half=True)
+                os.replace(new, folder)
+    return sets
+
+
+def find(folder: Path, patterns: Sequence[Array], which: int) -> tuple[FoundLights, bool]:
+    """The lights of a photo under one of several patterns, and whether that was recognised."""
+    capture = load_capture(folder)
+    try:
+        seen, found = find_pattern(capture, patterns)
+    except InputError:
+        found = -1
+    if found != which:
+        seen = capture
+    return find_lights(seen), found == which
+
+
+def known(found: FoundLights, folder: Path, stage: str) -> FoundLights:
+    """What was found, with the true places of camera and display or the true lights instead."""
+    if stage == FOUND:
+        return found
+    if stage == TRUE:
+        return replace(found, lights=true_lights(folder, found.capture))
+    true, rig = read_rig(folder / "truth" / "rig.toml").rig, found.lights.rig
+    rig = replace(rig, camera_shift=true.camera_shift, camera_tilt=true.camera_tilt)
+    return replace(found, lights=replace(found.lights, rig=rig))
+
+
+def shown_part(truth: Maps, found: FoundLights, folder: Path) -> tuple[Maps, tuple[int, ...]]:
+    """The true maps where the found camera takes the sample to be, since errors are those of the
+    material, not of the square's place; and the rectangle of them that is the sample."""
+    true, rig = read_rig(folder / "truth" / "rig.toml").rig, found.lights.rig
+    size, photo = len(truth.diffuse), found.capture.photo
+    pixels = rig.project(rig.sample_points(size, size), photo.height, photo.width)
+    rays = true.rays(pixels, photo.height, photo.width)
+    at = (true.camera - rays * (true.camera[2] / rays[..., 2:])) / true.sample_size
+    row, column = (0.5 - at[..., 1]) * size - 0.5, (at[..., 0] + 0.5) * size - 0.5
+    inside = (row > -0.5) & (row < size - 0.5) & (column > -0.5) & (column < size - 0.5)
+    at = np.stack([row, column])
+    images = {
+        name: np.stack([ndimage.map_coordinates(c, at, mode="nearest") for c in image], -1)
+        for name, image in (
+            ("diffuse", np.moveaxis(truth.diffuse, -1, 0)),
+            ("specular", np.moveaxis(truth.specular, -1, 0)),
+            ("roughness", truth.roughness[None]),
+            ("normal", np.moveaxis(truth.normal, -1, 0)),
+        )
+    }
+    images["roughness"] = images["roughness"][..., 0]
+    images["normal"] /= np.linalg.norm(images["normal"], axis=-1, keepdims=True)
+    rows, columns = (np.flatnonzero(inside.mean(k) > WHOLE) for k in (1, 0))
+    top, left = int(rows[0]), int(columns[0])
+    part = top, left, int(rows[-1]) + 1 - top, int(columns[-1]) + 1 - left
+    return Maps(**images), part
+
+
+def measure(found: Sequence[FoundLights], folders: Sequence[Path], size: int, stage: str) -> Row:
+    """The errors of the maps that so many photos give together."""
+    stages = Stages()
+    cpu = time.process_time()
+    told = [known(f, p, stage) for f, p in zip(found, folders, strict=True)]
+    crops = [Sample.of(f, size, whole=True) for f in told]
+    if stage != FOUND:
+        crops = [replace(c, place=np.eye(3)) for c in crops]
+    _, result, _ = estimate_maps(crops, stages)
+    cpu = time.process_time() - cpu
+    capture: Capture = found[0].capture
+    assert capture.truth is not None
+    truth, part = shown_part(resize_maps(capture.truth, size, size), told[0], folders[0])
+    maps = crop_maps(result.maps, *part)
+    truth = crop_maps(truth, *part)
+    return {
+        **map_errors(maps, truth),
+        "rerender": rerender_error(maps, truth),
+        "photos": result.photo_errors,
+        "left_out": result.left_out,
+        "processor_seconds": cpu,
+        "seconds": sum(stages.seconds.values()),
+    }
+
+
+def pooled(rows: Sequence[Row], kind: str) -> float:
+    """RMSE over all samples; ``average`` is the mean of the four maps'."""
+    if kind == "average":
+        return float(np.mean([pooled(rows, n) for n in NAMES]))
+    return float(np.sqrt(np.mean([r[kind] ** 2 for r in rows])))
+
+
+def error_table(results: dict[str, dict[int, list[Row]]]) -> Table:
+    """Errors by stage and number of photos, each over that of one photo as it is found."""
+    one = {kind: pooled(results[FOUND][1], kind) for kind in KINDS}
+    lines = [
+        [stage, number, *(pooled(rows, kind) / one[kind] for kind in KINDS)]
+        for stage, by_number in results.items()
+        for number, rows in by_number.items()
+    ]
+    return table(["lights", "photos", *KINDS], lines)
+
+
+def bars(results: dict[str, dict[int, list[Row]]], recognised: float) -> list[Bar]:
+    several = results[FOUND].get(OF_A_SET) or results[FOUND][max(results[FOUND])]
+    lines = [
+        bar(f"{kind}, set over one photo", pooled(several, kind) / pooled(results[FOUND][1], kind),
+            most, False)
+        for kind, most in RATIOS.items()
+    ]  # fmt: skip
+    return [*lines, bar("patterns recognised", recognised, 1.0, True)]
+
+
+def parser() -> argparse.ArgumentParser:
+    p = arguments(__doc__, "one small procedural sample, three photos", 16)
+    p.add_argument("--size", type=int, default=256, help="pixels a side of the maps (256)")
+    p.add_argument("--width", type=int, default=960, help="of the photos, pixels (960)")
+    p.add_argument("--spp", type=int, default=24, help="samples a pixel of ball and table (24)")
+    p.add_argument("--numbers", type=int, nargs="+", default=NUMBERS, help="of photos")
+    p.add_argument("--stages", nargs="+", choices=STAGES, default=STAGES)
+    return p
+
+
+def main(args: argparse.Namespace) -> None:
+    if args.quick:
+        count, size, width, spp, numbers = 1, 64, 640, 24, [1, 3]
+        real = (None, None)
+    else:
+        count, size, width, spp, numbers = args.count, args.size, args.width, args.spp, args.numbers
+        real = (args.materials, args.envs)
+    patterns = pattern_set(max(COUNTS))
+    sets = make_sets(args.out / "captures", count, max(numbers), size, width, spp, *real)
+    results: dict[str, dict[int, list[Row]]] = {
+        stage: {n: [] for n in numbers} for stage in args.stages
+    }
+    recognised = []
+    for folders in sets:
+        found = []
+        for i, folder in enumerate(folders):
+            lights, right = find(folder, patterns[: max(numbers)], i)
+            found.append(lights)
+            recognised.append(right)
+        for stage in args.stages:
+            for n in numbers:
+                row = measure(found[:n], folders[:n], size, stage)
+                results[stage][n].append({"sample": folders[0].parent.name, **row})
+                print(
+                    f"{folders[0].parent.name}, {stage}, {n}: "
+                    + ", ".join(f"{kind} {row[kind]:.4f}" for kind in KINDS)
+                    + f"; photos {', '.join(f'{e:.3f}' for e in row['photos'])}"
+                    + f"; {row['processor_seconds']:.1f} processor s",
+                    flush=True,
+                )
+    share = float(np.mean(recognised))
+    content = {"rows": results, "recognised": share, "bars": bars(results, share)}
+    write_results(args.out, content, {"errors over those of one photo": error_table(results)})
