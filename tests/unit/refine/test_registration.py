@@ -73,7 +73,7 @@ def test_photos_under_other_lights_are_registered_to_a_tenth_of_a_pixel(renderer
     errors = [off(p, t) for p, t in zip(found.places[1:], places[1:], strict=True)]
     assert min(off(np.eye(3), t) for t in places[1:]) > 2 * TENTH  # they were not before
     assert max(errors) < TENTH
-    assert found.deviations.max() < TENTH
+    assert np.all(errors < 3 * found.deviations[1:]) and found.deviations.max() < 2 * TENTH
     drift = found.factors[:, :, 0].mean(1) - found.factors[:, :, 0].mean()
     np.testing.assert_allclose(drift, 0.04 * (np.arange(3) - 1), atol=0.025)
 
