@@ -74,10 +74,10 @@ def in_photo(photo: Photo, rig: Rig, size: int, place: Array) -> Mask:
 def crop_mask(photo: Photo, rig: Rig, size: int, place: Array | None = None) -> Mask:
     """(size, size): pixels of `crop_part` that a saturated photo pixel touches, or that lie outside
     of the photo's own square of the sample."""
-    outside = np.zeros((size, size), bool)
+    outside: Mask = np.zeros((size, size), bool)
     if place is not None:
         points = _placed(rig.sample_points(size, size), rig, place)
-        outside = (np.abs(points[..., :2]) > rig.sample_size / 2 * CROP.beyond).any(-1)
+        outside |= np.any(np.abs(points[..., :2]) > rig.sample_size / 2 * CROP.beyond, axis=-1)
     corners = rig.project(_placed(rig.sample_corners, rig, place), photo.height, photo.width)
     x0, y0 = np.maximum(np.floor(corners.min(0)).astype(int) - CROP.mask_margin, 0)
     x1, y1 = np.maximum(np.ceil(corners.max(0)).astype(int) + CROP.mask_margin, 0)

@@ -10,6 +10,7 @@ textures repeat.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
@@ -53,7 +54,8 @@ def find_place(photos: tuple[Photo, Photo], rigs: tuple[Rig, Rig]) -> tuple[Arra
     photos, rigs: this one's and the other's, each with the camera as it was found.
     """
     s = PLACEMENT
-    turn = find_turn(*(crop_part(p, r, s.turn_side) for p, r in zip(photos, rigs, strict=True)))
+    upright = [crop_part(p, r, s.turn_side) for p, r in zip(photos, rigs, strict=True)]
+    turn = find_turn(upright[0], upright[1])
     c, d = np.cos(np.radians(turn)), np.sin(np.radians(turn))
     place = np.array([[c, -d, 0], [d, c, 0], [0, 0, 1]])
     wide = np.diag([s.wide, s.wide, 1.0])
@@ -140,10 +142,10 @@ def _best_shift(
     reach = int(s.farthest * side / 2)
     shape = (2 * side, 2 * side)
 
-    def spectrum(x: Array) -> Array:
+    def spectrum(x: Array) -> Any:
         return np.fft.rfft2(x, shape)
 
-    def crossed(a: Array, b: Array) -> Array:
+    def crossed(a: Any, b: Any) -> Array:
         """Sums over the overlap by shift, (2·reach + 1)², of b against a."""
         full = np.fft.irfft2(a * np.conj(b), shape)
         return np.roll(full, (reach, reach), (-2, -1))[..., : 2 * reach + 1, : 2 * reach + 1]
@@ -155,7 +157,7 @@ def _best_shift(
     k = (np.arange(2 * reach + 1) - reach) / (side / 2)
     far = (k[:, None] ** 2 + k**2) / s.usual**2
     score = (product / norm).mean(0) - s.doubt * far
-    i, j = np.unravel_index(int(np.argmax(score)), score.shape)
+    i, j = divmod(int(np.argmax(score)), score.shape[1])
     row = k[i] + _vertex(score[:, j], i) / (side / 2)
     column = k[j] + _vertex(score[i], j) / (side / 2)
     return float(score[i, j]), np.array([column, -row])
