@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from invrender.cli.beside import Submit, beside, cores, prepare
+from invrender.cli.beside import Submit, beside, cores
 from invrender.files.output import check_output
 from invrender.report.report import Report
 from invrender.tasks import map_tasks
@@ -71,6 +71,7 @@ Job = tuple[Path, Path, dict[str, Any]]
 
 def _ahead(jobs: Sequence[Job], submit: Submit) -> Iterator[Job]:
     """The jobs, each with what is prepared for it, which for the next begins with it."""
+    from invrender.pipeline import prepare
 
     def begin(job: Job) -> Any:
         options = job[2]

@@ -1,10 +1,11 @@
-"""Calls in a process beside this one. This module loads nothing heavy: it is used early."""
+"""Calls in a process beside this one."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
@@ -23,7 +24,10 @@ def beside() -> Iterator[Submit]:
     """A process of its own; what is yielded submits a call to it, which must be importable, and
     returns the call's future. The process ends with the block, at once where an error ends it."""
     before = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _leave_ctrl_c)
+    # A copy of this process has what is loaded; with threads of Dr.Jit or torch it might hang.
+    copied = sys.platform == "linux" and not {"drjit", "torch"} & sys.modules.keys()
+    context = multiprocessing.get_context("fork" if copied else "spawn")
+    pool = ProcessPoolExecutor(1, context, _leave_ctrl_c)
     try:
         yield pool.submit
     except BaseException:
@@ -32,13 +36,6 @@ def beside() -> Iterator[Submit]:
         raise
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-def prepare(*arguments: Any) -> Any:
-    """`invrender.pipeline.prepare`, for a process that need not load it in order to ask for it."""
-    from invrender.pipeline import prepare
-
-    return prepare(*arguments)
 
 
 def _leave_ctrl_c() -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from invrender.cli import arguments
-from invrender.cli.beside import beside, cores, prepare
+from invrender.cli.beside import beside, cores
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -87,6 +87,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
     # Where all is loaded already there is nothing to do beside finding the lights.
     if "drjit" in sys.modules or cores() == 1 or args.profile:
         return _refine_one(args, folders, options, console)
+    from invrender.pipeline import prepare
+
     with beside() as submit:
         prepared = submit(prepare, folders, known, args.size)
         return _refine_one(args, folders, {**options, "prepared": prepared}, console)
