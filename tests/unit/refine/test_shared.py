@@ -9,6 +9,8 @@ from invrender.pattern.default import block_pattern
 from invrender.refine.gauss_newton import Observation
 from invrender.refine.priors import network_prior
 from invrender.refine.shared import (
+    SHARED_SETTINGS,
+    _Problem,
     belongs,
     light_doubt,
     materials,
@@ -143,6 +145,25 @@ def test_doubtful_room_is_found(renderer):
     assert np.abs(room / 1.5 - 1).max() < 0.15
     shown = found.observations[0].renderer.render(to_maps(found.prior.mean))
     assert np.abs(shown - photo).mean() < 0.2 * np.abs(renderer.render(truth) - photo).mean()
+
+
+@pytest.mark.parametrize(("k_s", "alike"), [(0.04, 0.9), (0.8, 0.3)], ids=["paint", "metal"])
+def test_what_is_expected_before_the_photo(renderer, k_s, alike):
+    """Materials of a kind are off by much the same; a photo's colours are by nearly the same."""
+    maps = constant_maps(SIZE, SIZE, 0.6, 0.04, 0.8)
+    maps.diffuse[:8], maps.specular[:8], maps.roughness[:8] = 0.1, k_s, 0.3
+    theta = to_theta(maps)
+    shot = Observation(renderer.render(maps), renderer, doubt=(0.02, 0.1))
+    centres = materials(theta)
+    problem = _Problem([shot], prior_of(maps), theta, centres, 64, SHARED_SETTINGS)
+    expected = np.linalg.inv(problem.precision)
+    np.testing.assert_allclose(np.diag(expected)[:14], 1, rtol=1e-5)
+    np.testing.assert_allclose(expected[R, 7 + R], alike, rtol=1e-4)
+    np.testing.assert_allclose(expected[0, 1], 0.9, rtol=1e-4)
+    for k, sigma in ((14, 0.02), (17, 0.1)):
+        np.testing.assert_allclose(expected[k, k], 1.25 * sigma**2, rtol=1e-4)
+        np.testing.assert_allclose(expected[k, k + 1], sigma**2, rtol=1e-4)
+    assert expected[14, 17] == pytest.approx(0, abs=1e-9)
 
 
 def test_known_lights_are_no_unknowns(renderer):
