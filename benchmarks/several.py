@@ -53,7 +53,7 @@ NUMBERS = (1, *COUNTS)
 CAMERA_SHIFT, CAMERA_TILT = 2e-3, 1.0  # standard deviations, metres and degrees, of a hand
 NOISE = 0.005  # of the sensor
 SAMPLES, FINER = 256, 3  # of a texel; a side of a photo pixel, of texels
-WHOLE = 0.95  # of a row or column, that is the sample
+WHOLE = 0.95  # of the most that a row or column has of the sample
 KINDS = (*NAMES, "average", "rerender")
 FOUND, PLACED, TRUE = STAGES = ("found", "true places", "true lights")
 RATIOS = {"normal": 0.45, "diffuse": 0.5, "roughness": 0.75, "average": 0.6, "rerender": 0.5}
@@ -183,7 +183,8 @@ def shown_part(truth: Maps, found: FoundLights, folder: Path) -> tuple[Maps, tup
     }
     images["roughness"] = images["roughness"][..., 0]
     images["normal"] /= np.linalg.norm(images["normal"], axis=-1, keepdims=True)
-    rows, columns = (np.flatnonzero(inside.mean(k) > WHOLE) for k in (1, 0))
+    shares = inside.mean(1), inside.mean(0)
+    rows, columns = (np.flatnonzero(share > WHOLE * share.max()) for share in shares)
     top, left = int(rows[0]), int(columns[0])
     part = top, left, int(rows[-1]) + 1 - top, int(columns[-1]) + 1 - left
     return Maps(**images), part

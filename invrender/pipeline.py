@@ -240,7 +240,7 @@ def reconstruct(
     """The maps of a sample, from one photo or several and the lights found in them.
 
     found: what `find_lights` returns for each capture. Several are of the same square of one
-    sample, which may lie turned by quarters, under other patterns or in other rooms; they are
+    sample, which may lie turned, under other patterns or in other rooms; they are
     solved together, and the result is in the first one's frame and has its lights. size: pixels a
     side of the maps. init: "network", or "flat" for a start without a network. samples: of the
     specular lobe. progress: is told what is being done. Raises `InputError` where the sample is not

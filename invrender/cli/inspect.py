@@ -42,7 +42,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     import numpy as np
 
     from invrender.capture.lights import find_lights
-    from invrender.files.capture import Capture, check_photo, load_capture
+    from invrender.files.capture import Capture, check_photo, load_capture, set_patterns
     from invrender.files.images import read_photo
     from invrender.files.output import check_output
     from invrender.files.rig_toml import FOUND_IN_PHOTO
@@ -53,6 +53,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
     if args.out is not None:
         check_output(args.out, [args.capture], megabytes=PICTURE_MEGABYTES)
+    if args.capture.is_dir() and set_patterns(args.capture):
+        return _inspect_set(args, console)
     if args.capture.is_dir():
         capture = load_capture(args.capture)
     else:
@@ -124,4 +126,49 @@ def run(args: argparse.Namespace, console: Console) -> int:
         console.print(f"warning: {warning['text']}")
     for said in numbers["advice"]:
         console.print(f"next time: {said['text']}")
+    return 0
+
+
+def _inspect_set(args: argparse.Namespace, console: Console) -> int:
+    """What each photo under a set of patterns shows, a line each; what is left out, and why."""
+    from invrender.capture.lights import find_lights
+    from invrender.capture.which_pattern import find_pattern
+    from invrender.files.capture import load_set
+    from invrender.files.write import atomic_path
+    from invrender.report.inspection import annotate, summary
+    from invrender.types import InputError
+
+    if args.ball:
+        raise InputError("--ball is for one photo: inspect that one by itself")
+    captures, patterns = load_set(args.capture)
+    photos: dict[str, Any] = {}
+    for capture in captures:
+        name = capture.name.split("/")[-1]
+        try:
+            shown, which = find_pattern(capture, patterns)
+            found = find_lights(shown)
+        except InputError as error:
+            photos[name] = {"left_out": str(error)}
+            continue
+        photos[name] = {"pattern": which + 1, **summary(found)}
+        if args.out is not None:
+            args.out.mkdir(parents=True, exist_ok=True)
+            with atomic_path(args.out / f"inspect_{name}.png") as path:
+                annotate(found).save(path, format="PNG", compress_level=1)
+    if args.json:
+        print(json.dumps(photos))
+    for name, told in photos.items() if not args.json else ():
+        if "left_out" in told:
+            console.print(f"{name}  left out: {told['left_out']}")
+            continue
+        gain = ", ".join(f"{g:.3g}" for g in told["gain"])
+        console.print(
+            f"{name}  pattern {told['pattern']} of {len(patterns)}, ball with confidence "
+            f"{told['ball_confidence']:.2f}, radiance of white {gain}, pattern fits to "
+            f"{told['fit']['residual']:.1%}"
+        )
+        for warning in told["warnings"]:
+            console.print(f"  warning: {warning['text']}")
+    if all("left_out" in told for told in photos.values()):
+        raise InputError("no photo of the set can be used; the lines above tell why")
     return 0

@@ -68,7 +68,7 @@ def add_parser(commands: Any) -> None:
         "--joint",
         action="store_true",
         help="the captures show the same square of one sample (another pattern or room, the sample "
-        "turned by quarters): one result from all, in the frame of the first",
+        "turned): one result from all, in the frame of the first",
     )
     parser.add_argument("--workers", type=int, default=1, help="processes for several captures (1)")
     parser.add_argument(

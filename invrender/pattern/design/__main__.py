@@ -1,4 +1,5 @@
 """Search again for the pattern that ships: ``python -m invrender.pattern.design -o pattern.png``.
+With ``--set 5`` instead, for the names of the best set (`invrender.pattern.design.sets`).
 
 The mean criterion over the populations `SEEDS`, from a hue wheel; deterministic on one machine.
 Prints how far the outcome is from the shipped pattern, and both scores on a third population.
@@ -18,6 +19,8 @@ from invrender.pattern.default import default_pattern
 from invrender.pattern.design.criterion import Criterion
 from invrender.pattern.design.optimise import optimise, wheel
 from invrender.pattern.design.population import PATTERN_CELLS, draw_population, measure_responses
+from invrender.pattern.design.sets import best_set, candidates, set_errors
+from invrender.pattern.sets import COUNTS, pattern_set
 from invrender.rig import Rig
 from invrender.sampling import resize_pattern
 
@@ -27,13 +30,18 @@ GROUPS, ITERATIONS, WRITTEN_PIXELS = 320, 90, 256
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m invrender.pattern.design", description=__doc__)
-    parser.add_argument("-o", "--out", type=Path, required=True, help="PNG (sRGB)")
+    which = parser.add_mutually_exclusive_group(required=True)
+    which.add_argument("-o", "--out", type=Path, help="PNG (sRGB)")
+    which.add_argument("--set", type=int, dest="count", choices=COUNTS, help="photos of a set")
     args = parser.parse_args()
 
     def criterion(seed: int) -> Criterion:
         print(f"population {seed} ...", flush=True)
         return Criterion(measure_responses(Rig(), draw_population(Rig(), GROUPS, seed)))
 
+    if args.count is not None:
+        search_set(args.count, criterion(SEEDS[0]), criterion(HELD_OUT_SEED))
+        return
     parts = [criterion(seed) for seed in SEEDS]
 
     def mean(pattern: NDArray[np.floating]) -> tuple[float, NDArray[np.floating]]:
@@ -49,6 +57,17 @@ def main() -> None:
         errors = held_out.errors(pattern)
         maps = ", ".join(f"{m} {errors[m]:.4f}" for m in NAMES)
         print(f"{name:>8}: {maps}; criterion {errors['criterion']:.4f}")
+
+
+def search_set(count: int, criterion: Criterion, held_out: Criterion) -> None:
+    """Print the best set of ``count`` patterns, and its score beside the shipped one's."""
+    default = resize_pattern(default_pattern(), PATTERN_CELLS)
+    named = candidates(PATTERN_CELLS, default)
+    found = best_set(criterion, named, count, "default 0")
+    shipped = [resize_pattern(p, PATTERN_CELLS) for p in pattern_set(count)]
+    print(", ".join(found))
+    for name, patterns in (("found", [named[n] for n in found]), ("shipped", shipped)):
+        print(f"{name:>8}: criterion {set_errors(held_out, patterns)['criterion']:.4f}")
 
 
 if __name__ == "__main__":

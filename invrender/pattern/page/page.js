@@ -121,11 +121,13 @@ async function show() {
   }
   body.classList.add("shown");
   scrollTo(0, 0);
+  wind();
   layout();
 }
 
 function hide() {
   body.classList.remove("shown");
+  clearInterval(timer);
   step = 0;
   at("pattern").src = shown[0];
   if (document.fullscreenElement) document.exitFullscreen();
@@ -151,14 +153,21 @@ at("fill").addEventListener("click", () => {
 at("tablet").addEventListener("change", (e) => { if (e.target.value) setPpi(parseFloat(e.target.value)); });
 for (const id of ["ppi", "side", "deep", "scale"]) at(id).addEventListener("change", layout);
 at("show").addEventListener("click", show);
-// Of a set, a tap shows the next pattern; after the last, the page.
+// Of a set, a tap shows the next pattern, or a timer, which a tap starts anew; after the last, the
+// page.
+let timer = 0;
+function wind() {
+  clearInterval(timer);
+  const seconds = at("every") ? parseFloat(at("every").value) : 0;
+  if (seconds > 0) timer = setInterval(next, 1000 * seconds);
+}
 const shown = [at("pattern"), ...document.querySelectorAll("img.next")].map((image) => image.src);
 let step = 0;
 function next() {
   step = (step + 1) % shown.length;
   if (step) at("pattern").src = shown[step]; else hide();
 }
-at("pattern").addEventListener("click", next);
+at("pattern").addEventListener("click", () => { wind(); next(); });
 body.addEventListener("click", (e) => { if (e.target === body) hide(); });
 document.addEventListener("contextmenu", (e) => e.preventDefault());
 document.addEventListener("keydown", (e) => { if (e.key === "Escape") hide(); });

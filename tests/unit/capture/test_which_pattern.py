@@ -1,5 +1,6 @@
 """Which pattern of a set a photo shows."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -7,8 +8,11 @@ import pytest
 from synthetic_photo import grey_table, photograph, sky
 
 from invrender.capture.which_pattern import find_pattern
+from invrender.cli.main import main
 from invrender.files.capture import Capture
 from invrender.files.images import Photo
+from invrender.files.rig_toml import write_rig
+from invrender.files.write import write_exr
 from invrender.pattern.sets import COUNTS, pattern_set
 from invrender.rig import Rig
 from invrender.types import InputError
@@ -53,3 +57,16 @@ def test_sets_begin_each_other_and_give_light_everywhere():
             assert pattern.min() > 0 and pattern.max() <= 1
     with pytest.raises(InputError, match="2, 3, 5, 8"):
         pattern_set(4)
+
+
+def test_inspect_tells_of_each_photo_of_a_set(tmp_path, capsys):
+    write_rig(tmp_path / "rig.toml", RIG)
+    for k, pattern in enumerate(SET[:2], 1):
+        write_exr(tmp_path / f"pattern_{k}.exr", pattern)
+    write_exr(tmp_path / "photo_1.exr", capture_of(SET[1]).photo.image)
+    empty = photograph(RIG, *SIZE, sky, grey_table, SET[0], ball=None)
+    write_exr(tmp_path / "photo_2.exr", np.asarray(empty, np.float32))
+    assert main(["inspect", str(tmp_path), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["photo_1"]["pattern"] == 2 and told["photo_1"]["ball_confidence"] > 0.5
+    assert "ball" in told["photo_2"]["left_out"]

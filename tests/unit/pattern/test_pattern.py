@@ -35,8 +35,10 @@ from invrender.pattern.design import (
     wheel,
 )
 from invrender.pattern.design.population import _shade
+from invrender.pattern.design.sets import best_set, candidates, set_errors
 from invrender.pattern.display import pattern_page
 from invrender.pattern.guide import _guide, _sheet, needed_focal
+from invrender.pattern.sets import pattern_set
 from invrender.rig import Rig
 from invrender.sampling import resize_pattern
 from invrender.sheet import capture_sheet, marker_dictionary
@@ -445,3 +447,37 @@ def test_page_shows_the_pattern_in_real_size(tmp_path):
         assert not [p for p in page.problems if "requestFullscreen" not in str(p)]
     finally:
         page.close()
+
+
+def test_a_set_is_stepped_through_by_taps_or_by_a_timer(tmp_path):
+    if CHROMIUM is None:
+        pytest.skip("no Chromium here (apt-get install chromium)")
+    path = tmp_path / "a.html"
+    first, *rest = pattern_set(3, 16)
+    path.write_text(pattern_page(first, 0.1, 110, rest=rest))
+    page = Page(1000, 800)
+    try:
+        page.open(path)
+        page.js("document.documentElement.requestFullscreen = undefined")
+        page.js("window.setInterval = (f, after) => { window.tick = f; window.after = after }")
+        page.js('at("show").click()')
+        page.js('at("pattern").click()')
+        assert page.js("[step, window.after === undefined]") == [1, True]  # by taps alone
+        page.js('hide(); at("every").value = "2.5"; at("show").click()')
+        assert page.js("[step, after]") == [0, 2500]
+        page.js("tick(); tick()")
+        assert page.js('[step, at("pattern").src === shown[2]]') == [2, True]
+        assert page.js("body.className") == "shown"
+        page.js("tick()")
+        assert page.js("[step, body.className]") == [0, ""]
+    finally:
+        page.close()
+
+
+def test_the_best_set_is_better_than_what_it_is_chosen_from(criterion):
+    named = candidates(SIDE, resize_pattern(default_pattern(), SIDE))
+    pair, three = (best_set(criterion, named, n, "default 0") for n in (2, 3))
+    assert pair[0] == three[0] == "default 0" and len(set(three)) == 3
+    score = lambda names: set_errors(criterion, [named[n] for n in names])["criterion"]  # noqa: E731
+    assert score(three) < score(pair) < score(["default 0"])
+    assert all(score(pair) <= score(["default 0", name]) + 1e-9 for name in named)
