@@ -29,7 +29,7 @@ from benchmarks.baselines.methods import METHODS, parameters, trained, training_
 from benchmarks.common.captures import arguments
 from benchmarks.common.held_out import FIRST_SEED, HeldOut, draw, draw_setting, photograph
 from benchmarks.common.lpips import Lpips
-from benchmarks.common.paper_pictures import draw_clues, draw_denoised, draw_maps
+from benchmarks.common.paper_pictures import draw_clues, draw_denoised, draw_maps, draw_perturbed
 from benchmarks.common.perturbed import GREY_FREE, KINDS, METHODS_OF_RIG, measure_perturbed
 from benchmarks.common.plot import plot_error_over_time
 from benchmarks.common.results import Bar, Table, bar, table, write_results
@@ -47,7 +47,7 @@ from nets.predict import Reconstructor, estimate_of
 
 NUMBERS = Path(__file__).with_name("paper_numbers.toml")
 SHOWN = 4  # captures whose pictures are drawn
-BEYOND = 4  # captures a point of the curves beyond the paper's
+PERFECT = 6  # captures under a pattern that the ball shows without a mosaic
 JUDGED = (0, 4, 8)  # of the nine re-rendered images: LPIPS and FLIP take as long as all else
 # The program's first network by the real materials that it saw: the shipped one, and the state from
 # which its training goes on with more of them.
@@ -270,9 +270,9 @@ def table_2(conditions: dict[str, list[dict[str, float]]]) -> Table:
 # --- beyond ---------------------------------------------------------------------------------------
 
 
-def beyond(args: argparse.Namespace, count: int, sizes: Sequence[int]) -> dict[str, Table]:
+def beyond(args: argparse.Namespace, sizes: Sequence[int]) -> dict[str, Table]:
     """Average map RMSE of the shipped program against photos, size, device and materials."""
-    folders = args.materials, args.envs
+    folders, count = (args.materials, args.envs), args.photographs
 
     def error(maps: Maps, truth: Maps) -> float:
         size = min(maps.shape[0], SIZE)
@@ -328,7 +328,9 @@ def patterns() -> list[Array]:
 
 
 def parser() -> argparse.ArgumentParser:
-    return arguments(__doc__, "four small captures, shorter refinement, no photographs", 48)
+    p = arguments(__doc__, "four small captures, shorter refinement, no photographs", 48)
+    p.add_argument("--photographs", type=int, default=2, help="a point of Fig. 15 and of `beyond`")
+    return p
 
 
 def _kept(file: Path, make: Callable[[], Any]) -> Any:
@@ -394,7 +396,7 @@ def main(args: argparse.Namespace) -> None:
 
     def perfect() -> list[dict[str, float]]:
         taken = (draw(k, SIZE, args.materials, args.envs, mosaic=False, real_device=False)
-                 for k in range(min(args.count, 1 if args.quick else 12)))  # fmt: skip
+                 for k in range(1 if args.quick else PERFECT))  # fmt: skip
         return [denoised(c.batch()) for c in taken]
 
     tables["Table 2"] = table_2({
@@ -405,10 +407,11 @@ def main(args: argparse.Namespace) -> None:
     reached = bars(pooled, rows)
     if not args.quick:
         sizes = (32, 64, 128)
-        tables |= _kept(args.out / "rows" / "beyond.json", lambda: beyond(args, BEYOND, sizes))
-        perturbed = measure_perturbed(args.out, args.materials, args.envs)
+        tables |= _kept(args.out / "rows" / "beyond.json", lambda: beyond(args, sizes))
+        perturbed = measure_perturbed(args.out, args.materials, args.envs, args.photographs)
         tables |= perturbed_tables(perturbed)
         results["perturbed"] = perturbed
+        draw_perturbed(args.out / "fig_15.png", perturbed_curves(perturbed))
         reached += perturbed_bars(perturbed)
     panels = {
         what: {
@@ -436,6 +439,19 @@ def perturbed_tables(perturbed: dict[str, dict[str, list[Row]]]) -> dict[str, Ta
             ],
         )
         for kind in KINDS
+    }
+
+
+def perturbed_curves(
+    perturbed: dict[str, dict[str, list[Row]]],
+) -> dict[str, dict[str, list[tuple[float, float | None]]]]:
+    """Points (level, error) by perturbation and method."""
+    return {
+        kind: {
+            m: [(float(x), _root_mean_square([r[m] for r in rows])) for x, rows in levels.items()]
+            for m in METHODS_OF_RIG
+        }
+        for kind, levels in perturbed.items()
     }
 
 

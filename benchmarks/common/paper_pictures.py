@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +61,23 @@ def draw_denoised(
         denoised = decode(network(batch)["denoised"])
     parts = (batch["photo"], denoised, batch["ideal"])
     save_grid(file, [[("", as_displayed(x)) for x in parts]], ("photo", "denoised", "ideal"))
+
+
+def draw_perturbed(
+    file: Path, curves: Mapping[str, Mapping[str, Sequence[tuple[float, float | None]]]]
+) -> None:
+    """A panel a perturbation: average map errors against its level, a curve a method."""
+    figure, axes = plt.subplots(1, len(curves), figsize=(4 * len(curves), 3.2), squeeze=False)
+    for axis, (kind, methods) in zip(axes[0], curves.items(), strict=True):
+        for method, points in methods.items():
+            known = sorted((x, y) for x, y in points if y is not None)
+            axis.plot(*zip(*known, strict=True), "o-", ms=3, label=method)
+        axis.set(xlabel=kind, ylabel="average map RMSE", ylim=(0, None))
+        axis.grid(alpha=0.2)
+    axes[0, 0].legend(fontsize=8)
+    figure.tight_layout()
+    figure.savefig(file, dpi=100)
+    plt.close(figure)
 
 
 def as_displayed(x: Tensor) -> Array:

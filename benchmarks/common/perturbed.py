@@ -26,7 +26,6 @@ from invrender.rig import Rig
 from invrender.types import Array, InputError
 
 DRAWN = CaptureSet("families", 470_000)
-SAMPLES = 2  # materials and rooms, each photographed at every level
 SIZE, WIDTH, SPP = 96, 480, 16
 METHODS_OF_RIG = ("as it is", "registered", "no registration")
 
@@ -64,15 +63,16 @@ def perturbed(kind: str, level: float, k: int) -> tuple[Rig, Array]:
 
 
 def measure_perturbed(
-    out: Path, materials: Path | None, rooms: Path | None
+    out: Path, materials: Path | None, rooms: Path | None, count: int
 ) -> dict[str, dict[str, list[dict[str, Any]]]]:
-    """Average map errors by perturbation and level; a list of samples, None where refused."""
+    """Average map errors by perturbation and level; a list of ``count`` samples, each photographed
+    at every level, None where the program refuses the photograph."""
     found: dict[str, dict[str, list[dict[str, Any]]]] = {}
     for kind, (still, levels) in KINDS.items():
         found[kind] = {}
         for level in (still, *levels):
             rows = found[kind][f"{level:.4g}"] = []
-            for k in range(SAMPLES):
+            for k in range(count):
                 name = "nominal" if level == still else f"{kind}_{level:.4g}"
                 file = out / "rows" / f"{name}_{k}.json"
                 if not file.exists():

@@ -11,6 +11,7 @@ from benchmarks import paper  # noqa: E402
 from benchmarks.baselines import methods  # noqa: E402
 from benchmarks.baselines.flash import SIZE  # noqa: E402
 from benchmarks.common import held_out, perturbed  # noqa: E402
+from benchmarks.common.paper_pictures import draw_perturbed  # noqa: E402
 from invrender.rig import Rig  # noqa: E402
 from nets.model import encode  # noqa: E402
 
@@ -73,6 +74,15 @@ def test_bars_of_perturbations_ask_the_near_ones_alone():
     }  # fmt: skip
     found = paper.perturbed_bars(rows)
     assert len(found) == 4 and all(b["ok"] and b["value"] == 1 for b in found)
+
+
+def test_curves_of_perturbations_leave_out_what_is_refused(tmp_path):
+    row = dict.fromkeys(perturbed.METHODS_OF_RIG, 0.1)
+    refused = dict.fromkeys(perturbed.METHODS_OF_RIG)
+    curves = paper.perturbed_curves({"shift": {"0": [row, refused], "0.6": [refused]}})
+    assert curves["shift"]["as it is"] == [(0, pytest.approx(0.1)), (0.6, None)]
+    draw_perturbed(tmp_path / "f.png", curves)
+    assert (tmp_path / "f.png").stat().st_size > 1000
 
 
 def test_a_capture_is_of_its_number_alone():
