@@ -2,14 +2,15 @@
 
 import asyncio
 
-import numpy as np
 import pytest
 from app_client import running
 
 import invrender
 from invrender.app import patterns
 from invrender.app import server as server_module
+from invrender.app.profiles import Profile
 from invrender.data import procedural_environment, procedural_material
+from invrender.files.rig_toml import rig_text
 
 RIG = invrender.Rig(ball_radius=0.02)  # large in a small photo
 
@@ -18,13 +19,15 @@ RIG = invrender.Rig(ball_radius=0.02)  # large in a small photo
 def test_from_five_uploads_to_maps(tmp_path, monkeypatch):
     monkeypatch.setattr(server_module, "SIZES", (32,))
     monkeypatch.setattr(server_module, "CHECK_SECONDS", 1e4)  # the machine may be busy
+    # Lens and ball are stated: what looks for them is tested elsewhere.
+    monkeypatch.setattr(Profile, "rig_toml", lambda self: rig_text(self.rig(), "pattern.exr"))
     maps = procedural_material(3, 128, 128, kind="rusty_metal")
-    room = 0.1 * procedural_environment(0, 32)
+    room = 0.05 * procedural_environment(0, 32)
     photos = {}
     for name in patterns.PATTERN_NAMES:
         folder = tmp_path / name
         pattern = patterns.pattern(name)
-        invrender.simulate(folder, maps, room, pattern, RIG, width=480, spp=8)
+        invrender.simulate(folder, maps, room, pattern, RIG, gain=3.0, width=480, spp=8)
         photos[name] = (folder / "photo.exr").read_bytes()
 
     async def all_of_it():
@@ -52,5 +55,4 @@ def test_from_five_uploads_to_maps(tmp_path, monkeypatch):
     id = asyncio.run(all_of_it())
     result = invrender.Result.load(tmp_path / "data" / "captures" / id / "result")
     error = invrender.maps.map_errors(result.maps, invrender.maps.resize_maps(maps, 32, 32))
-    print(error)
-    assert np.isfinite(error["average"]) and error["average"] < 0.1
+    assert error["average"] < 0.06 and error["normal"] < 0.04  # 0.040 and 0.027
