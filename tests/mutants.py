@@ -27,7 +27,7 @@ OWN = {
     "groups": ("test_groups.py", "test_shared.py"),
     "mirrors": ("test_mirrors.py",),
     "posterior": ("test_posterior.py",),
-    "several": ("test_several.py",),
+    "several": ("test_several.py", "test_refine.py"),
     "shared": ("test_shared.py",),
     "shared_roughness": ("test_several.py",),
 }
