@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from invrender.cli import arguments
-from invrender.cli.beside import beside, cores
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -79,6 +78,8 @@ def add_parser(commands: Any) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
+    from invrender.cli.beside import beside, cores
+
     folders = args.capture
     known = {"ball": args.ball, "environment": _room(args.environment), "gain": args.gain}
     options = {"size": args.size, "init": args.init, "samples": args.samples, **known}
