@@ -71,7 +71,7 @@ def measure(shot: Shot) -> dict[str, Any] | None:
         return None
     level = photo.clip_level / np.asarray(rig.ball_reflectance)
     x = environment / level
-    raised, factor = raise_clipped(
+    raised, factor, _ = raise_clipped(
         photo, rig, image, (shot.pattern, shot.gain, shot.device), environment, coverage
     )  # fmt: skip
     results: list[Array] = [

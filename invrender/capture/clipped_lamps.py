@@ -1,4 +1,4 @@
-"""Lamps that a photo clips, made as bright as the table around the sample says they are.
+"""Lamps that a photo clips, and a screen of doubtful gain, as bright as the table says they are.
 
 A clipped pixel says only that there was at least so much light. But room and screen light the
 table as well, and the screen's share of that, whose radiance the ball shows, has a shape and
@@ -6,6 +6,8 @@ colours of its own: the brighter the room, the flatter and less coloured the tab
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from scipy import optimize
@@ -35,62 +37,114 @@ def clipped_share(photo: Photo, rig: Rig, image: BallImage, height: int) -> Arra
 
 def raise_clipped(
     photo: Photo, rig: Rig, image: BallImage, screen: tuple[Array, Array, Device],
-    environment: Array, coverage: Array,
-) -> tuple[Array, float]:  # fmt: skip
-    """The environment (H, 2H, 3) with its clipped texels raised; and how many times, the mean.
+    environment: Array, coverage: Array, gain_deviation: float = 0.0,
+) -> tuple[Array, float, Array]:  # fmt: skip
+    """The environment (H, 2H, 3) with its clipped texels raised; how many times, the mean; and the
+    factor (3,) on the screen's gain.
 
-    The screen: pattern (h, w, 3), gain (3,) and display. One factor per channel is found for
-    all clipped texels, the most probable one under a log-normal prior and a Lambertian table: the
+    The screen: pattern (h, w, 3), gain (3,) and display; ``gain_deviation`` is that of the
+    logarithm of its gain, by the ball. One factor per channel is found for all clipped texels, and
+    where the gain is in doubt one for the screen, the most probable ones under log-normal priors
+    and a Lambertian table: the
     logarithms of its radiance some way apart are compared, robustly (Cauchy), since textures,
     papers and shadows have edges, and colour apart from brightness, which varies more. That the
-    screen shades the table from the clipped lamps counts too. 1 where nothing is clipped.
+    screen shades the table from the clipped lamps counts too. 1 where nothing is clipped, and where
+    the gain is known.
     """
     share = clipped_share(photo, rig, image, len(environment))
-    if not share.any():
-        return environment, 1.0
-    assert photo.clip_level is not None
-    extra = np.asarray(share * photo.clip_level / np.asarray(rig.ball_reflectance), np.float32)
+    same = np.ones(3)
+    doubt = CLIPPED_LAMPS.gain_doubt * gain_deviation
+    doubted = gain_deviation > CLIPPED_LAMPS.known_gain
+    if not (share.any() or doubted):
+        return environment, 1.0, same
+    level = photo.clip_level or 0.0
+    extra = np.asarray(share * level / np.asarray(rig.ball_reflectance), np.float32)
     filled = fill_environment(environment, coverage)
-    seen, at, use, known = lit_table(photo, rig, image.ball, screen, filled)
-    factor = np.exp(_excess(seen, use, known, room_irradiance(rig, at, extra)))
+    seen, at, use, lit, room = lit_table(photo, rig, image.ball, screen, filled)
+    lamps = room_irradiance(rig, at, extra)
+    factors = _Factors(seen, use, lit, room, lamps)
+    x, y = factors.fit(0.0)
+    if doubted:
+        tried = factors.fit(doubt)
+        # Textures, and a lamp that the screen hides, spoil the table's word.
+        told = factors.spread(*tried).max() < CLIPPED_LAMPS.plain
+        if told and abs(tried[1].mean()) < CLIPPED_LAMPS.likely_gain * doubt:
+            x, y = tried
+    factor, gain = np.exp(x), np.exp(y)
     raised = environment + extra * (factor - 1).astype(np.float32)
-    return np.asarray(raised, np.float32), float(factor.mean())
+    return np.asarray(raised, np.float32), float(factor.mean()), gain
 
 
-def _excess(seen: Array, use: Mask, known: Array, extra: Array) -> Array:
-    """Logarithms (3,) of the clipped light's factor.
+class _Factors:
+    """Logarithms of the clipped light's factor and of the screen's, (3,) each, by the table.
 
-    ``seen``: log radiance of the used blocks (n, 3); irradiance is known + (factor - 1)·extra.
+    ``seen``: log radiance of the used blocks (n, 3); irradiance is
+    factor·``lit`` + ``room`` + (factor - 1)·``lamps``.
     """
-    apart = distant_pairs(use)
-    pairs = [pair for pair, _ in apart]
-    # Textures are alike over several blocks: so many pairs count as one.
-    weights = [1 / lag for _, lag in apart]
 
-    def steps(log: Array) -> list[Array]:
-        return [(log[i] - log[j]) @ AXES for i, j in pairs]
+    def __init__(self, seen: Array, use: Mask, lit: Array, room: Array, lamps: Array) -> None:
+        self.lit, self.room, self.lamps = lit, room, lamps
+        apart = distant_pairs(use)
+        self.pairs = [pair for pair, _ in apart]
+        # Textures are alike over several blocks: so many pairs count as one.
+        self.weights = [1 / lag for _, lag in apart]
+        self.wanted = self._steps(seen)
 
-    wanted = steps(seen)
+    def _steps(self, log: Array) -> list[Array]:
+        return [(log[i] - log[j]) @ AXES for i, j in self.pairs]
 
-    def off(x: Array) -> list[Array]:
-        light = known + np.expm1(x) * extra
-        return [w - s for w, s in zip(wanted, steps(np.log(np.maximum(light, TINY))), strict=True)]
+    def errors(self, x: Array, y: Array) -> list[Array]:
+        """Of each lag, (pairs, 3), along `AXES`."""
+        light = np.exp(y) * self.lit + self.room + np.expm1(x) * self.lamps
+        steps = self._steps(np.log(np.maximum(light, TINY)))
+        return [w - s for w, s in zip(self.wanted, steps, strict=True)]
 
-    def residuals(x: Array, scales: list[Array]) -> Array:
-        brightness = (x.mean() - CLIPPED_LAMPS.mean) / CLIPPED_LAMPS.deviation
-        parts = [np.array([brightness]), (x - x.mean()) / CLIPPED_LAMPS.channel_deviation]
-        for error, scale, weight in zip(off(x), scales, weights, strict=True):
-            parts.append((weight * cauchy_residuals(error / scale)).ravel())
-        return np.concatenate(parts)
+    def spread(self, x: Array, y: Array) -> Array:
+        """The errors' spread (3,) along `AXES`, the median lag's."""
+        spreads = [np.maximum(spread(e, 0), TABLE_METER.least_spread) for e in self.errors(x, y)]
+        return np.asarray(np.median(spreads, 0)) if spreads else np.full(3, math.inf)
 
-    x = np.full(3, CLIPPED_LAMPS.mean)
-    low, high = CLIPPED_LAMPS.inside, CLIPPED_LAMPS.greatest - CLIPPED_LAMPS.inside
-    for turn in range(3):
-        scales = [np.maximum(spread(e, 0), TABLE_METER.least_spread) for e in off(x)]
-        if turn == 0:  # the Cauchy loss has more than one minimum
-            starts = [np.full(3, s) for s in np.linspace(*CLIPPED_LAMPS.starts)]
-            x = min(starts, key=lambda s: float((residuals(s, scales) ** 2).sum()))
-        bounds = (0, CLIPPED_LAMPS.greatest)
-        x = optimize.least_squares(residuals, np.clip(x, low, high), "3-point",
-                                   bounds, args=(scales,)).x  # fmt: skip
-    return np.asarray(x)
+    def fit(self, doubt: float) -> tuple[Array, Array]:
+        """The most probable ones; the screen's stays where ``doubt``, its deviation, is 0."""
+        free = np.array([self.lamps.any(), doubt > 0]).repeat(3)
+        if not free.any():
+            return np.zeros(3), np.zeros(3)
+
+        def whole(z: Array) -> tuple[Array, Array]:
+            both = np.zeros(6)
+            both[free] = z
+            return both[:3], both[3:]
+
+        def residuals(z: Array, scales: list[Array]) -> Array:
+            x, y = whole(z)
+            parts = []
+            if free[0]:
+                parts.append(_about(x, CLIPPED_LAMPS.mean, CLIPPED_LAMPS.deviation,
+                                    CLIPPED_LAMPS.channel_deviation))  # fmt: skip
+            if free[3]:
+                parts.append(_about(y, 0.0, doubt, doubt * CLIPPED_LAMPS.channel_doubt))
+            for error, scale, weight in zip(self.errors(x, y), scales, self.weights, strict=True):
+                parts.append((weight * cauchy_residuals(error / scale)).ravel())
+            return np.concatenate(parts)
+
+        least = np.array([0.0, -CLIPPED_LAMPS.greatest]).repeat(3)[free]
+        z = np.array([CLIPPED_LAMPS.mean, 0.0]).repeat(3)[free]
+        for turn in range(3):
+            scales = [
+                np.maximum(spread(e, 0), TABLE_METER.least_spread) for e in self.errors(*whole(z))
+            ]
+            if turn == 0 and free[0]:  # the Cauchy loss has more than one minimum
+                starts = [
+                    np.array([s, 0.0]).repeat(3)[free] for s in np.linspace(*CLIPPED_LAMPS.starts)
+                ]
+                z = min(starts, key=lambda s: float((residuals(s, scales) ** 2).sum()))
+            inside = CLIPPED_LAMPS.inside
+            z = np.clip(z, least + inside, CLIPPED_LAMPS.greatest - inside)
+            bounds = (least, CLIPPED_LAMPS.greatest)
+            z = optimize.least_squares(residuals, z, "3-point", bounds, args=(scales,)).x
+        return whole(np.asarray(z))
+
+
+def _about(x: Array, mean: float, deviation: float, channels: float) -> Array:
+    """Residuals (4,) of a log-normal prior: of the channels' mean, and of each about that."""
+    return np.array([(x.mean() - mean) / deviation, *((x - x.mean()) / channels)])

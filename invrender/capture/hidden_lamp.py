@@ -42,8 +42,8 @@ def add_hidden_lamp(
     s, t, _ = screen_coordinates(rig, np.asarray(ball.position), d)
     row, column = (np.clip(np.nan_to_num(a) * parts, 0, parts - 1).astype(int) for a in (t, s))
     part = np.where((coverage <= 0) & (d[..., 2] > 0), row * parts + column, -1)
-    seen, at, use, known = lit_table(photo, rig, ball, screen, environment)
-    shading = _Shading(seen, use, known)
+    seen, at, use, lit, room = lit_table(photo, rig, ball, screen, environment)
+    shading = _Shading(seen, use, lit + room)
     best = None
     for k, light in enumerate(_part_lights(rig, at, environment, part)):
         for x in shading.starts(light):

@@ -186,14 +186,18 @@ def _measure(
     fit["ball_reflectance_deviation"] = 0.0 if known else ball.reflectance_deviation or 0.0
     fit["room_saturated"] = _room_saturated(photo, rig, image)
     environment, coverage = unfold_environment(photo, rig, image, height, screen.blur)
-    environment, fit["room_raised"] = raise_clipped(photo, rig, image, lit, environment, coverage)
+    environment, fit["room_raised"], factor = raise_clipped(
+        photo, rig, image, lit, environment, coverage,
+        screen.gain_deviation if screen.saturated > SCREEN_FIT.saturated else 0.0,
+    )  # fmt: skip
+    gain = screen.gain * factor
+    fit["gain_by_table"] = float(factor.mean())
+    lit = capture.pattern, gain, screen.device
     environment = fill_environment(environment, coverage)
     environment, fit["hidden_lamp"] = add_hidden_lamp(photo, rig, ball, lit, environment, coverage)
     size = min(PATTERN_CHECK.captured_size, max(capture.pattern.shape[:2]))
     captured = unfold_pattern(photo, rig, ball, size)
-    lights = Lights(
-        rig, capture.pattern, environment, screen.gain, coverage, captured, fit, screen.device
-    )
+    lights = Lights(rig, capture.pattern, environment, gain, coverage, captured, fit, screen.device)
     return lights, screen.response
 
 
@@ -264,8 +268,9 @@ def light_warnings(lights: Lights) -> tuple[Notice, ...]:
     fit = lights.fit
     if fit.get("saturated", 0) > SCREEN_FIT.saturated and not fit.get("gain_by_paper"):
         text = (
-            f"{fit['saturated']:.0%} of the screen is saturated in the ball; its radiance is "
-            f"read from the rest, to ± {fit.get('gain_deviation', 0):.0%}: expose shorter"
+            f"{fit['saturated']:.0%} of the screen is saturated in the ball; its radiance is read "
+            f"from the rest, to ± {fit.get('gain_deviation', 0):.0%}, and from the table's "
+            "shading: expose shorter"
         )
         notices.append(Notice("screen-saturated", text))
     if fit.get("room_saturated", 0) > PATTERN_CHECK.room_saturated:

@@ -56,11 +56,11 @@ def find_ball_and_orientation(
             continue
         if manual is None and here.tilt_deviation is None:
             _check_uncropped(here, ball)
-        expected = likeness(
-            unfold_pattern(here.photo, here.rig, ball, ORIENTATION.cells),
-            resize_pattern(here.pattern, ORIENTATION.cells),
-        )
-        if expected > 1 - ORIENTATION.better:  # no orientation can be so much more alike
+        seen, white = unfold_pattern(here.photo, here.rig, ball, ORIENTATION.cells), white_of(here)
+        expected = likeness(seen, resize_pattern(here.pattern, ORIENTATION.cells), white)
+        tells = (seen < ORIENTATION.saturated * white).any(-1).mean() > ORIENTATION.telling
+        # No orientation can be so much more alike, or the screen is white in all of them.
+        if expected > 1 - ORIENTATION.better or not tells:
             found.append((here, ball, _notices(first, 0, False)))
             break
         nominal = replace(nominal, rig=replace(nominal.rig, ball_shape=here.rig.ball_shape))
@@ -170,11 +170,12 @@ def _best_orientation(capture: Capture, ball: Ball) -> tuple[tuple[int, int, boo
     """Quarters of the photo and of the pattern, and whether that is mirrored, by which the ball
     shows the pattern best; and how alike they are then."""
     best, alike = (0, 0, False), -1.0
+    white = white_of(capture)
     pattern = resize_pattern(capture.pattern, ORIENTATION.cells)
     for turn, seen in seen_patterns(capture, ball):
         for mirrored in (False, True):
             for quarter in range(4):
-                score = likeness(seen, oriented(pattern, quarter, mirrored))
+                score = likeness(seen, oriented(pattern, quarter, mirrored), white)
                 if score > alike:
                     alike, best = score, (turn, quarter, mirrored)
     return best, alike
@@ -243,8 +244,20 @@ def _turned(capture: Capture, ball: Ball, turns: int) -> tuple[Photo, Ball | Non
     return photo, replace(moved, camera_tilt=tuple(tilt.tolist()))
 
 
-def likeness(seen: Array, shown: Array) -> float:
-    """Correlation in [-1, 1] of two images, each channel about its own mean and spread."""
+def white_of(capture: Capture) -> Array:
+    """Radiance (3,) from which the ball's image is saturated; infinite where nothing is."""
+    level = capture.photo.clip_level or math.inf
+    return np.asarray(level / np.broadcast_to(capture.rig.ball_reflectance, 3))
+
+
+def likeness(seen: Array, shown: Array, white: Array) -> float:
+    """Correlation in [-1, 1] of two images (n, n, 3), each channel about its own mean and spread.
+
+    What is seen is saturated from ``white`` (3,) on; as much of what is ``shown`` counts as that.
+    """
+    saturated = (seen >= ORIENTATION.saturated * white).mean((0, 1))
+    tops = [np.quantile(shown[..., c], 1 - saturated[c]) for c in range(3)]
+    shown = np.minimum(shown, tops)
     a, b = (x.reshape(-1, 3) - x.reshape(-1, 3).mean(0) for x in (seen, shown))
     spread = a.std(0) * b.std(0)
     least = ORIENTATION.least_spread * np.abs(seen).mean() * np.abs(shown).mean()

@@ -25,7 +25,7 @@ from invrender.capture.least_squares import minimise
 from invrender.capture.response import Response, curve_precision, curve_shares
 from invrender.capture.robust import spread as robust_spread
 from invrender.capture.settings import DISPLAY, JPEG_GAMMA, JPEG_LUMA, SCREEN_FIT, TONE_CURVE
-from invrender.device import IDEAL, Device
+from invrender.device import GAMMAS, IDEAL, Device
 from invrender.files.images import Photo
 from invrender.rig import Rig
 from invrender.sampling import resize_pattern
@@ -86,6 +86,8 @@ def fit_screen(
         return ideal
     fit.free[:_COLOUR] = True
     fit.free[_GAMMA] = ideal.saturated < SCREEN_FIT.no_curve
+    if not fit.free[_GAMMA.start]:  # what is left of the screen tells little of its colour
+        fit.prior[_GAIN, _GAIN] = _APART / SCREEN_FIT.white_deviation**2
     start = u
     for first in (0, 2):  # if the greatest blur leads astray, without it
         u = fit.start()
@@ -111,6 +113,7 @@ _SHIFT, _TILT, _GAMMA, _GAIN, _BLUR, _COLOUR, _FALLOFF, _BLACK, _MIXING, _CURVE 
 )  # fmt: skip
 _COUNT = _CURVE.stop
 _DEVICE = slice(_FALLOFF, _MIXING.stop)
+_APART = np.eye(3) - 1 / 3  # of what channels differ from their mean
 _PAIRS = [(i, j) for i in range(3) for j in range(3) if i != j]  # of channels: `_MIXING`
 
 
@@ -220,8 +223,8 @@ class _Fit:
 
     def set_gamma_prior(self, deviation: float) -> None:
         """The deviation of the display's log gamma, of the channels' mean."""
-        apart = np.eye(3) - 1 / 3
-        self.prior[_GAMMA, _GAMMA] = apart / SCREEN_FIT.channel_deviation**2 + 1 / 9 / deviation**2
+        apart = _APART / SCREEN_FIT.channel_deviation**2
+        self.prior[_GAMMA, _GAMMA] = apart + 1 / 9 / deviation**2
 
     def focus(self, blurred: float) -> None:
         """Take the image ``blurred`` further for what follows."""
@@ -351,7 +354,7 @@ class _Fit:
 
     def device(self, u: Array) -> Device:
         """The display that ``u`` describes."""
-        gamma = tuple(np.exp(u[_GAMMA]).tolist())
+        gamma = tuple(np.clip(np.exp(u[_GAMMA]), *GAMMAS).tolist())
         red, green, blue = ((r, g, b) for r, g, b in self.mixing(u).tolist())
         return Device(float(u[_FALLOFF]), gamma, float(u[_BLACK]), (red, green, blue))
 

@@ -268,6 +268,9 @@ class SheetFit:
     room_deviation: float = 0.5  # of the room's factor about 1; by hand
     vignetting_deviation: float = 0.3  # of the light that a corner lacks; by hand
     gains_differ: float = 3.0  # deviations between the gains by paper and ball; by hand
+    useful: float = (
+        0.5  # deviation of its logarithm to which the gain by paper says something; by hand
+    )
     scale: float = 0.02  # of the ball's radius, by which it contradicts the sheet's; by hand
 
 
@@ -282,6 +285,8 @@ class Orientation:
     unlike: float = 0.5
     flat: float = 0.05  # standard deviation of a pattern without sides to tell; by hand
     least_spread: float = 1e-3  # of the means' product, of a channel that counts; by hand
+    saturated: float = 0.98  # of white, beside which a look-up of a saturated pixel lies; by hand
+    telling: float = 0.2  # share of the screen that must not be white to tell the pattern; by hand
 
 
 @dataclass(frozen=True)
@@ -360,6 +365,7 @@ class ScreenFit:
     tilt_deviation: float = 6.0  # degrees; by hand
     gamma_deviation: float = 0.5  # of the logarithm of the display's gamma; by hand
     channel_deviation: float = 0.03  # of the channels about their mean, likewise; by hand
+    white_deviation: float = 0.25  # of log gains about their mean, if much is saturated; by hand
     expected_blur: float = 0.5  # pixels; by hand
     blur_deviation: float = 0.7  # of the blurs' logarithms; by hand
     colour_blur: float = 0.9  # pixels, of colours in a JPEG at half the resolution; by hand
@@ -498,6 +504,14 @@ class ClippedLamps:
     mean: float = 0.5
     deviation: float = 1.0
     channel_deviation: float = 0.25
+    # Deviation of the log gain from which the screen is measured by the table too; by what that is
+    # multiplied where some of the screen is saturated; and of the channels, in that; by hand.
+    known_gain: float = 0.05
+    gain_doubt: float = 3.0
+    channel_doubt: float = 0.5
+    # The table is believed where its errors with another gain are so small, in logarithms; by hand.
+    plain: float = 0.06
+    likely_gain: float = 2.0  # deviations, in that, by which it may differ; by hand
     greatest: float = 6.0  # by hand
     starts: tuple[float, float, int] = (0.05, 4, 10)  # from, to, number; by hand
     inside: float = 1e-6  # distance of a start from the bounds; by hand

@@ -606,7 +606,12 @@ def screen_gain(found: FoundSheet, lights: Lights) -> tuple[Array, float] | None
     def errors(x: Array) -> Array:
         bright = screen * given * x[:3] + x[3] * room
         off = (bright * (1 - x[4] * found.white_aside[:, None]) - seen) * weight
-        prior = (x[3] - 1) / SHEET_FIT.room_deviation, x[4] / SHEET_FIT.vignetting_deviation
+        white = np.log(np.maximum(given * x[:3], TINY))
+        prior = (
+            *((white - white.mean()) / SCREEN_FIT.white_deviation),
+            (x[3] - 1) / SHEET_FIT.room_deviation,
+            x[4] / SHEET_FIT.vignetting_deviation,
+        )
         return np.append(off.ravel(), prior)
 
     done = least_squares(errors, np.array([1.0, 1, 1, 1, 0]), loss="soft_l1")
@@ -644,7 +649,7 @@ def use_paper(
     gain, deviation = measured
     off = float(np.mean(gain) / np.mean(lights.gain))
     fit = {**lights.fit, "paper_gain": off, "paper_gain_deviation": deviation}
-    if fit.get("saturated", 0) > SCREEN_FIT.saturated:
+    if fit.get("saturated", 0) > SCREEN_FIT.saturated and deviation < SHEET_FIT.useful:
         text = (
             f"{fit['saturated']:.0%} of the screen is saturated in the ball; its radiance was "
             f"taken from the capture sheet's paper, to within {deviation:.0%}"

@@ -18,16 +18,16 @@ from invrender.types import Array, Mask
 
 def lit_table(
     photo: Photo, rig: Rig, ball: Ball, screen: tuple[Array, Array, Device], environment: Array
-) -> tuple[Array, Array, Mask, Array]:
+) -> tuple[Array, Array, Mask, Array, Array]:
     """The blocks that show the table: log radiance (n, 3), points (n, 3), which those are (h, w),
-    and their irradiance (n, 3) from the screen (pattern, gain, display) and the filled
+    and their irradiance (n, 3) from the screen (pattern, gain, display), and from the filled
     environment."""
     seen, points, use = table_blocks(photo, rig, ball)
     at = points[use]
     lit = screen_irradiance(rig, at, screen, TABLE_METER.screen_cells)
     rows = TABLE_METER.environment_rows
     room = room_irradiance(rig, at, resample_environment(environment, rows))
-    return np.log(seen[use]), at, use, lit + room
+    return np.log(seen[use]), at, use, lit, room
 
 
 def screen_irradiance(

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from invrender.capture.orientation import find_either_ball, likeness, posed, seen_patterns
+from invrender.capture.orientation import find_either_ball, likeness, posed, seen_patterns, white_of
 from invrender.capture.settings import ORIENTATION, WHICH_PATTERN
 from invrender.files.capture import Capture
 from invrender.sampling import resize_pattern
@@ -24,9 +24,10 @@ def find_pattern(capture: Capture, patterns: Sequence[Array]) -> tuple[Capture, 
     here, tilt_deviation = posed(capture)
     here, ball = find_either_ball(here, None, tilt_deviation)
     small = [resize_pattern(p, ORIENTATION.cells) for p in patterns]
+    white = white_of(here)
     scores = np.full((4, len(small)), -1.0)
     for turn, seen in seen_patterns(here, ball):
-        scores[turn] = [likeness(seen, pattern) for pattern in small]
+        scores[turn] = [likeness(seen, pattern, white) for pattern in small]
     turn, which = (int(i) for i in np.unravel_index(np.argmax(scores), scores.shape))
     best = scores.max(0)
     (x, y), r = ball.centre, ball.radius

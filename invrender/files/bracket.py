@@ -19,7 +19,8 @@ import numpy as np
 from scipy import ndimage
 
 from invrender.files.images import Photo
-from invrender.sampling import knot_shares, knot_slopes
+from invrender.files.tone_curves import curve_prior
+from invrender.sampling import knot_shares
 from invrender.types import Array, InputError, Mask, Notice
 
 
@@ -38,9 +39,7 @@ class BracketSettings:
     # Linear values; the curve's logarithms are linear between, and nought at the fixed one.
     knots: tuple[float, ...] = (0.003, 0.01, 0.03, 0.08, 0.2, 0.4, 0.65, 0.95)
     fixed: int = 3
-    # Of the curve's slope about 1, with EXIF's exposures and without: then only its bends show.
-    slope_deviation: tuple[float, float] = (0.5, 0.15)
-    bend_deviation: float = 0.4  # of its change from knot to knot
+    curved: float = 8.0  # by how much a straight curve's squared errors must be larger
     bin: float = 0.15  # of the logarithm, of the pixels whose median is taken
     least_bin: int = 30  # pixels in one
     bin_deviation: float = 0.03  # of that median
@@ -199,13 +198,11 @@ def _tone_curve(
         )
         pairs.append((k, shorter, longer))
 
-    slope, bend = knot_slopes(knots)
-    smooth = [
-        slope / BRACKET.slope_deviation[exposures is None],
-        bend / BRACKET.bend_deviation,
-    ]
-    rows = [np.pad(np.concatenate(smooth), ((0, 0), (0, n)))]
-    right = [np.zeros(len(rows[0]))]
+    # The prior as rows of a triangle, whose square is the inverse covariance.
+    mean, covariance = curve_prior(np.asarray(BRACKET.knots), BRACKET.fixed)
+    triangle = np.linalg.cholesky(np.linalg.inv(covariance)).T
+    rows = [np.pad(triangle, ((0, 0), (0, n)))]
+    right = [triangle @ mean]
     known = BRACKET.exif_error if exposures else BRACKET.unknown_exposure
     for place, deviation, value in [
         (BRACKET.fixed, BRACKET.certain, 0.0),
@@ -238,7 +235,15 @@ def _tone_curve(
             row[count + k], row[count + k - 1] = 1, -1
             rows.append(row[None] / deviation)
             right.append(np.array([ratio / deviation]))
+    matrix, values = np.concatenate(rows[1:]), np.concatenate(right[1:])
     solution = np.linalg.lstsq(np.concatenate(rows), np.concatenate(right))[0]
+    # A straight file is likelier than the family says, and contradicted by what is not straight.
+    straight = np.zeros(count + n)
+    straight[count:] = np.linalg.lstsq(matrix[:, count:], values)[0]
+    worse = np.square(matrix @ straight - values).sum()
+    worse -= np.square(matrix @ solution - values).sum()
+    if worse < BRACKET.curved:
+        solution = straight
     curve, logs = solution[:count], solution[count:]
 
     def light(log: Array) -> Array:

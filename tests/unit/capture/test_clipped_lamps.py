@@ -79,7 +79,8 @@ def picture(light, albedo, room=room):
 def test_the_table_tells_how_bright_clipped_lamps_are(light, albedo):
     photo, environment, coverage = picture(light, albedo)
     truth = room(directions(256, 512).astype(float))
-    raised, factor = raise_clipped(photo, RIG, IMAGE, SCREEN, environment, coverage)
+    raised, factor, gain = raise_clipped(photo, RIG, IMAGE, SCREEN, environment, coverage)
+    assert (gain == 1).all()
 
     def error(seen):
         seen = fill_environment(seen, coverage)
@@ -93,11 +94,32 @@ def test_the_table_tells_how_bright_clipped_lamps_are(light, albedo):
     assert (raised == environment)[dark].mean() > 0.99  # all but those beside a lamp
 
 
+@pytest.mark.parametrize("times", [0.6, 1.5])
+def test_the_table_tells_a_gain_that_the_ball_leaves_in_doubt(light, times):
+    photo, environment, coverage = picture(light, plain_table)
+    wrong = PATTERN, GAIN * times, IDEAL
+    deviation = 0.2
+    _, _, factor = raise_clipped(photo, RIG, IMAGE, wrong, environment, coverage, deviation)
+    assert abs(np.log(factor * times)).max() < 0.5 * abs(np.log(times))
+    # A gain that the ball shows well is not touched.
+    _, _, factor = raise_clipped(photo, RIG, IMAGE, wrong, environment, coverage, 0.01)
+    assert (factor == 1).all()
+
+
+def test_a_hidden_lamp_cannot_make_the_screen_dark():
+    """In a JPEG no such lamp is looked for, and light that the screen hides from the table looks
+    like a dim screen: the ball's own doubt limits what the table may change."""
+    photo, environment, coverage = picture(table_light(hidden_lamp), plain_table, hidden_lamp)
+    for deviation, most in ((0.06, 0.25), (0.14, 0.5)):
+        found = raise_clipped(photo, RIG, IMAGE, SCREEN, environment, coverage, deviation)
+        assert abs(np.log(found[2]).mean()) < most
+
+
 def test_nothing_clipped_nothing_raised(light):
     photo, environment, coverage = picture(light, grey_table)
     for whole in (replace(photo, clip_level=None), replace(photo, clip_level=2.0)):
         found = raise_clipped(whole, RIG, IMAGE, SCREEN, environment, coverage)
-        assert found[0] is environment and found[1] == 1
+        assert found[0] is environment and found[1] == 1 and (found[2] == 1).all()
 
 
 def test_the_table_tells_of_a_lamp_behind_the_screen():
@@ -134,7 +156,7 @@ def test_a_table_that_says_nothing_leaves_the_prior(table, light):
     image[:, :250] = image[:, 390:] = table
     image[:180] = image[300:] = table
     bad = replace(photo, image=image)
-    raised, factor = raise_clipped(bad, RIG, IMAGE, SCREEN, environment, coverage)
+    raised, factor, _ = raise_clipped(bad, RIG, IMAGE, SCREEN, environment, coverage)
     assert np.isfinite(raised).all() and 1 <= factor < 500
 
 

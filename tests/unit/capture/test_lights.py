@@ -316,6 +316,16 @@ def test_the_tilt_turns_with_the_photo(tilted):
     np.testing.assert_allclose(ball.camera_tilt, rig.camera_tilt, atol=0.5)
 
 
+def test_a_screen_that_is_nearly_all_white_is_not_another_pattern():
+    """An exposure for the sample: what is seen of the pattern says nothing of its orientation."""
+    image = photograph(RIG, *SIZE, table=textured_table, gain=40 * GAIN)
+    photo = Photo(np.minimum(image, 1).astype(np.float32), 1.0)
+    here, ball, notices = find_ball_and_orientation(Capture(photo, RIG, PATTERN))
+    assert here.pattern is PATTERN and not notices
+    assert off(ball, true_ball())[0] < 0.05
+    assert measure_lights(here, ball, 32).fit["saturated"] > 0.7
+
+
 def test_a_tilt_that_the_rig_tells_is_kept(tilted):
     rig, photo = tilted
     ball = make_ball(rig, rig.ball_centre, rig.ball_radius, SIZE)

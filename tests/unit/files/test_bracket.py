@@ -1,5 +1,6 @@
 """Several exposures of one set-up become one linear photo."""
 
+import itertools
 from dataclasses import replace
 
 import cv2
@@ -68,6 +69,37 @@ def test_the_curve_needs_no_exif_where_it_is_nearly_straight():
     shots = [expose(image, t, lambda x: x) for t in (1.0, 0.25)]
     merged = merge_bracket([replace(s, exposure=None) for s in shots], ["a", "b"])
     assert error(merged, image)[0] < 0.03
+
+
+def unevenness(merged, truth):
+    """By how much the logarithm of merged over true radiance differs between levels of that."""
+    levels = np.geomspace(0.1, 2, 8)
+    ratio = np.log(np.maximum(merged.image, 1e-6) / truth)
+    inside = [(truth > a) & (truth < b) for a, b in itertools.pairwise(levels)]
+    return float(np.ptp([np.median(ratio[k]) for k in inside]))
+
+
+def film(x):
+    """Narkowicz's fit of the ACES curve, which has a toe and a shoulder."""
+    return 1.2 * x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14)
+
+
+@pytest.mark.parametrize("curve", [shoulder, film])
+@pytest.mark.parametrize("times", [3.0, 10.0])
+def test_two_exposures_however_far_apart_give_the_curve(curve, times):
+    """A curve whose slope changes with a period of the exposures' ratio explains two photos as
+    well: what curves are like decides."""
+    image = scene(2)
+    shots = [expose(image, 1 / times, curve), expose(image, 1.0, curve)]
+    merged = merge_bracket(shots, ["a", "b"])
+    assert unevenness(merged, image) < 0.12
+
+
+def test_a_straight_curve_stays_straight():
+    image = scene(3)
+    shots = [expose(image, t, lambda x: x) for t in (0.1, 1.0)]
+    merged = merge_bracket(shots, ["a", "b"])
+    assert unevenness(merged, image) < 0.02
 
 
 def test_bad_brackets_are_refused_in_one_sentence():
