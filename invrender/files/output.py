@@ -39,7 +39,9 @@ def _check(out: Path, inputs: list[Path], file: bool, megabytes: float) -> None:
                 f"{out} is, or lies in, the input's folder: results there could replace what they "
                 "are made from; choose another place"
             )
-    if not file and (out / "rig.toml").is_file() and not (out / "report.json").is_file():
+    # A result has a rig.toml too, and no report where a run was killed that was replacing it.
+    result = any((out / name).is_file() for name in ("report.json", "sample.exr"))
+    if not file and (out / "rig.toml").is_file() and not result:
         raise InputError(f"{out} holds a capture; choose another folder for the results")
     folder = place.parent if file or not out.exists() else place
     while not folder.exists():

@@ -90,7 +90,8 @@ class Result:
                 # The one file that a result may lack: an older result's would be read as its own.
                 if self.lights.coverage is None:
                     (out / "coverage.exr").unlink(missing_ok=True)
-                for file in sorted(new.iterdir(), key=lambda f: f.name == "report.json"):
+                order = {"sample.exr": 0, "report.json": 2}  # the first tells it from a capture
+                for file in sorted(new.iterdir(), key=lambda f: order.get(f.name, 1)):
                     os.replace(file, out / file.name)
         except OSError as error:
             raise InputError(f"{out} cannot be written: {error.strerror or error}") from None

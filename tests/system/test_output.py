@@ -52,6 +52,17 @@ def test_a_place_beside_the_capture_is_taken(capture, tmp_path):
     check_output(tmp_path / "a.glb", [capture], file=True)
 
 
+def test_a_result_that_was_being_replaced_may_be_made_again(capture, tmp_path):
+    """Killed then, a run leaves a folder with a rig.toml and without a report: no capture."""
+    out = tmp_path / "out"
+    out.mkdir()
+    shutil.copy(capture / "rig.toml", out)
+    with pytest.raises(InputError, match="holds a capture"):
+        check_output(out, [capture])
+    (out / "sample.exr").touch()
+    check_output(out, [capture])
+
+
 def test_a_place_that_cannot_be_written_is_found_before(capture, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("x")
     for out in (tmp_path / "file", tmp_path / "file" / "below", tmp_path / ("x" * 300)):
