@@ -40,10 +40,9 @@ from invrender.colour import PRIMARIES, linear_to_srgb, srgb_to_linear, to_rec70
 from invrender.data.simulate import SAMPLE_LEVEL, simulate_real
 from invrender.data.simulate_camera import Camera, seen, toned
 from invrender.data.simulate_setup import PHOTO_KINDS, draw_setup
-from invrender.device import IDEAL, Device
 from invrender.files.capture import Capture, load_capture
 from invrender.files.rig_toml import read_rig
-from invrender.lights import Lights
+from invrender.lights import IDEAL, Device, Lights
 from invrender.maps import map_errors, resize_maps
 from invrender.pattern.default import default_pattern
 from invrender.pipeline import Sample, Stages, estimate_maps, reconstruct

@@ -34,10 +34,10 @@ from benchmarks.common.perturbed import GREY_FREE, KINDS, METHODS_OF_RIG, measur
 from benchmarks.common.plot import plot_error_over_time
 from benchmarks.common.results import Bar, Table, bar, table, write_results
 from invrender.maps import NAMES, Maps, map_errors, resize_maps
-from invrender.metrics import flip
 from invrender.pattern.default import default_pattern
 from invrender.pipeline import Stages, estimate_maps
 from invrender.render.point_lights import GAMMA, grid_lights, relight
+from invrender.report.metrics import flip
 from invrender.rig import Rig
 from invrender.types import Array, InputError
 from nets.batch import Batch

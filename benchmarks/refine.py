@@ -27,12 +27,12 @@ from invrender.capture.lights import find_lights
 from invrender.data import EXAMPLE
 from invrender.files.capture import load_capture
 from invrender.maps import NAMES, Maps, constant_maps, map_errors, resize_maps
-from invrender.metrics import calibration
 from invrender.pipeline import Sample, Stages, estimate_maps
 from invrender.refine.checks import coarse_error, photo_error
 from invrender.refine.theta import deviations
 from invrender.render.point_lights import rerender
 from invrender.render.renderer import Renderer
+from invrender.report.metrics import calibration
 from invrender.report.notices import POOR_FIT
 from invrender.types import Array, InputError
 

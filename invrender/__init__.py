@@ -20,13 +20,12 @@ from lazy_loader import attach
 if TYPE_CHECKING:
     from invrender.capture.lights import find_lights
     from invrender.data.simulate import simulate
-    from invrender.device import Device
     from invrender.files.capture import Capture, load_capture
-    from invrender.lights import Lights
+    from invrender.lights import Device, Lights
     from invrender.maps import Estimate, Maps
-    from invrender.metrics import evaluate
     from invrender.pipeline import reconstruct
     from invrender.render.image import render
+    from invrender.report.metrics import evaluate
     from invrender.report.result import Result
     from invrender.rig import Rig
     from invrender.types import InputError
@@ -54,12 +53,11 @@ __getattr__, __dir__, _ = attach(
     {
         "capture.lights": ["find_lights"],
         "data.simulate": ["simulate"],
-        "device": ["Device"],
         "files.capture": ["Capture", "load_capture"],
-        "lights": ["Lights"],
+        "lights": ["Device", "Lights"],
         "maps": ["Estimate", "Maps"],
-        "metrics": ["evaluate"],
         "pipeline": ["reconstruct"],
+        "report.metrics": ["evaluate"],
         "report.result": ["Result"],
         "rig": ["Rig"],
         "types": ["InputError"],

@@ -168,7 +168,7 @@ class Rig:
 
         From ``points`` (..., 3) that face up, below the screen's front; (..., cells, cells), row 0
         at the pattern's top. Times a pattern's radiance and summed it is the irradiance. falloff:
-        the display's (`invrender.device.Device`), times cos(θ')^falloff.
+        the display's (`invrender.lights.Device`), times cos(θ')^falloff.
         """
         e_x, e_y = self.screen_edges
         t = (np.arange(cells) + 0.5) / cells

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from invrender.device import IDEAL, Device
+from invrender.lights import IDEAL, Device
 from invrender.render.backend import Float, dr, vector
 from invrender.render.fast.estimator import Fast
 from invrender.render.scene import Scene, make_scene, make_view

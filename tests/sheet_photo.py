@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
+from invrender.capture.sheet_layout import Sheet, capture_sheet, draw_sheet
 from invrender.pattern.default import default_pattern
 from invrender.rig import Rig
 from invrender.sampling import resize_pattern
-from invrender.sheet import Sheet, capture_sheet, draw_sheet
 
 RESOLUTION = 6000  # pixels a metre of the sheet's picture
 

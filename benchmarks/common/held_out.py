@@ -13,8 +13,7 @@ import numpy as np
 import torch
 
 from benchmarks.baselines.flash import SIZE, flash_photos
-from invrender.device import IDEAL, Device
-from invrender.lights import Lights
+from invrender.lights import IDEAL, Device, Lights
 from invrender.maps import Maps, resize_maps
 from invrender.pattern.default import default_pattern
 from invrender.pipeline import Sample

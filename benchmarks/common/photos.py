@@ -24,8 +24,8 @@ from invrender.capture.table import room_irradiance
 from invrender.colour import linear_to_srgb, srgb_to_linear
 from invrender.data.environments import find_environments, procedural_environment, read_environment
 from invrender.data.materials import procedural_material
-from invrender.device import Device
 from invrender.files.images import Photo
+from invrender.lights import Device
 from invrender.maps import Maps, resize_maps
 from invrender.pattern.default import default_pattern
 from invrender.render import Fast, make_scene

@@ -18,8 +18,8 @@ from invrender.capture.robust import cauchy_residuals, spread
 from invrender.capture.settings import CLIPPED_LAMPS, TABLE_METER
 from invrender.capture.table import distant_pairs, lit_table, room_irradiance
 from invrender.colour import AXES
-from invrender.device import Device
 from invrender.files.images import Photo
+from invrender.lights import Device
 from invrender.rig import Rig
 from invrender.types import TINY, Array, Mask
 

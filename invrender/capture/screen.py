@@ -25,8 +25,8 @@ from invrender.capture.least_squares import minimise
 from invrender.capture.response import Response, curve_precision, curve_shares
 from invrender.capture.robust import spread as robust_spread
 from invrender.capture.settings import DISPLAY, JPEG_GAMMA, JPEG_LUMA, SCREEN_FIT, TONE_CURVE
-from invrender.device import GAMMAS, IDEAL, Device
 from invrender.files.images import Photo
+from invrender.lights import GAMMAS, IDEAL, Device
 from invrender.rig import Rig
 from invrender.sampling import resize_pattern
 from invrender.types import TINY, Array, InputError

@@ -22,12 +22,7 @@ from invrender.capture.camera import is_whole
 from invrender.capture.mirror import Ball
 from invrender.capture.response import Response
 from invrender.capture.settings import GAUSSIAN_SPREAD, SCREEN_FIT, SHEET_FIT
-from invrender.capture.table import room_irradiance, screen_irradiance
-from invrender.files.capture import Capture
-from invrender.files.images import Photo
-from invrender.lights import Lights
-from invrender.rig import Rig, fov_of
-from invrender.sheet import (
+from invrender.capture.sheet_layout import (
     FAMILY,
     MODULES,
     PAPER,
@@ -36,6 +31,11 @@ from invrender.sheet import (
     capture_sheet,
     marker_dictionary,
 )
+from invrender.capture.table import room_irradiance, screen_irradiance
+from invrender.files.capture import Capture
+from invrender.files.images import Photo
+from invrender.lights import Lights
+from invrender.rig import Rig, fov_of
 from invrender.sphere import resample_environment
 from invrender.types import TINY, Array, InputError, Mask, Notice
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from invrender.capture.mirror import Ball
 from invrender.capture.settings import TABLE_METER
-from invrender.device import Device
 from invrender.files.images import Photo
+from invrender.lights import Device
 from invrender.rig import Rig
 from invrender.sampling import resize_pattern
 from invrender.sphere import resample_environment, sky_flux

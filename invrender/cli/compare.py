@@ -28,7 +28,7 @@ def add_parser(commands: Any) -> None:
 
 def run(args: argparse.Namespace, console: Console) -> int:
     """Run the subcommand."""
-    from invrender.metrics import FLIP_MISSING, map_metrics
+    from invrender.report.metrics import FLIP_MISSING, map_metrics
     from invrender.types import InputError
 
     for path in (args.a, args.b):
@@ -89,7 +89,7 @@ def _same_size(a: Any, b: Any) -> tuple[Any, Any, str]:
 def _images(a: Path, b: Path) -> dict[str, float | None]:
     """Metrics of two files: linear radiance if either is an EXR or HDR, else as displayed."""
     from invrender.files.images import read_image
-    from invrender.metrics import image_metrics
+    from invrender.report.metrics import image_metrics
 
     hdr = any(path.suffix.lower() in (".exr", ".hdr", ".pic") for path in (a, b))
     # Display values are compared as they are stored.

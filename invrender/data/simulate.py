@@ -16,10 +16,10 @@ import numpy as np
 
 from invrender.data.simulate_camera import developed, seen, to_jpeg
 from invrender.data.simulate_setup import Setup
-from invrender.device import IDEAL, Device
 from invrender.files.maps import write_maps
 from invrender.files.rig_toml import FOUND_IN_PHOTO, write_rig
 from invrender.files.write import write_exr
+from invrender.lights import IDEAL, Device
 from invrender.maps import Maps
 from invrender.rig import Rig, fov_of
 from invrender.types import Array, InputError
@@ -129,8 +129,8 @@ def _light(
     seed: int,
 ) -> Array:  # fmt: skip
     """Radiance at the photo's pixels and around them, as `seen` takes it."""
+    from invrender.capture.sheet_layout import capture_sheet, draw_sheet
     from invrender.render.path_traced import photograph
-    from invrender.sheet import capture_sheet, draw_sheet
 
     wide = math.ceil(width * setup.camera.wider / 2) * 2
     high = math.ceil(width * 3 // 4 * setup.camera.wider / 2) * 2

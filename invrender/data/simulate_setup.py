@@ -13,7 +13,7 @@ import numpy as np
 
 from invrender.data.simulate_camera import HALF_WIDTH, Camera
 from invrender.data.tablets import find_tablet
-from invrender.device import IDEAL, Device
+from invrender.lights import IDEAL, Device
 from invrender.rig import Rig, fov_of
 from invrender.types import Array, InputError, Vec3
 

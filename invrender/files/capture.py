@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from invrender.device import IDEAL, Device
 from invrender.files.images import PHOTOS, Photo, read_image, read_photo
 from invrender.files.maps import read_maps
 from invrender.files.rig_toml import RigFile, read_rig
+from invrender.lights import IDEAL, Device
 from invrender.maps import Maps
 from invrender.rig import Rig
 from invrender.types import Array, InputError, Notice

@@ -8,8 +8,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from invrender.device import IDEAL, Device
 from invrender.files.write import atomic_path
+from invrender.lights import IDEAL, Device
 from invrender.rig import BALL_SHAPES, Rig
 from invrender.types import InputError, Notice, Vec3
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from invrender.capture.sheet_layout import Sheet, capture_sheet, marker_bits
 from invrender.files.write import atomic_path
 from invrender.rig import Rig
-from invrender.sheet import Sheet, capture_sheet, marker_bits
 from invrender.types import InputError
 
 MM = 1 / 25.4  # inches

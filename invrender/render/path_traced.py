@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from invrender.device import IDEAL, Device
-from invrender.lights import Lights
+from invrender.lights import IDEAL, Device, Lights
 from invrender.maps import Maps
 from invrender.render import brdf
 from invrender.render.backend import BACKEND, dr

@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from invrender.device import IDEAL, Device
-from invrender.lights import Lights
+from invrender.lights import IDEAL, Device, Lights
 from invrender.render.backend import Float, ad, dr, vector
 from invrender.rig import Rig
 from invrender.types import InputError

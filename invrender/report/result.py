@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 
 from invrender.colour import srgb_to_linear
-from invrender.device import IDEAL, Device
 from invrender.files.images import read_image
 from invrender.files.maps import read_maps, write_maps
 from invrender.files.rig_toml import read_rig, write_rig
 from invrender.files.write import write_exr, write_png
-from invrender.lights import Lights
+from invrender.lights import IDEAL, Device, Lights
 from invrender.maps import NAMES, Estimate, Maps
 from invrender.report.report import Report
 from invrender.types import Array, InputError

@@ -29,7 +29,7 @@ from safetensors.numpy import save_file
 
 from invrender.data.environments import find_environments
 from invrender.data.materials import find_materials
-from invrender.device import Device
+from invrender.lights import Device
 from invrender.maps import Maps
 from invrender.refine.lobes import lobe_terms, read_lobes
 from invrender.render.backend import dr

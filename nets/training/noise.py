@@ -11,7 +11,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, zoom
 
 from invrender.data.simulate_setup import RANGES
-from invrender.device import IDEAL, Device
+from invrender.lights import IDEAL, Device
 from invrender.sphere import resample_environment
 from invrender.types import Array
 from nets.splitsum import area_resize

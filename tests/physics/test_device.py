@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from forward_scenes import ESTIMATORS, some_environment, some_maps, some_pattern
 
-from invrender.device import Device
-from invrender.lights import Lights
+from invrender.lights import Device, Lights
 from invrender.render.backend import dr
 from invrender.render.path_traced import path_traced, sample_scene
 from invrender.render.renderer import Material

@@ -12,7 +12,7 @@ from forward_scenes import (
     some_pattern,
 )
 
-from invrender.device import Device
+from invrender.lights import Device
 from invrender.maps import constant_maps
 from invrender.render import brdf
 from invrender.render.backend import Float, ad, dr, vector

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from invrender.capture.lights import find_lights
-from invrender.device import Device
 from invrender.files.capture import load_capture
+from invrender.lights import Device
 from invrender.types import InputError
 
 PATTERN = np.random.default_rng(0).uniform(0, 1, (3, 5, 3)).astype(np.float32)

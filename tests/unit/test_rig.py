@@ -4,8 +4,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from invrender.device import Device
 from invrender.files.rig_toml import read_rig, write_rig
+from invrender.lights import Device
 from invrender.rig import Rig
 from invrender.types import InputError
 

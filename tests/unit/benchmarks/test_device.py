@@ -7,8 +7,7 @@ import pytest
 
 from benchmarks import device
 from benchmarks.common.captures import OTHERS, PHOTOGRAPHS
-from invrender.device import Device
-from invrender.lights import Lights
+from invrender.lights import Device, Lights
 from invrender.report.advice import screen_light
 from invrender.rig import Rig
 

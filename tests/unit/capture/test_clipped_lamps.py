@@ -13,8 +13,8 @@ from invrender.capture.environment import fill_environment, unfold_environment
 from invrender.capture.hidden_lamp import add_hidden_lamp
 from invrender.capture.mirror import make_ball
 from invrender.capture.table import hidden_by_screen, room_irradiance
-from invrender.device import IDEAL
 from invrender.files.images import Photo
+from invrender.lights import IDEAL
 from invrender.rig import Rig
 from invrender.sphere import directions, irradiance, solid_angles
 

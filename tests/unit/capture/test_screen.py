@@ -12,8 +12,8 @@ from invrender.capture.ball_image import trace_image
 from invrender.capture.mirror import make_ball
 from invrender.capture.settings import SCREEN_FIT, TONE_CURVE
 from invrender.colour import linear_to_srgb, srgb_to_linear
-from invrender.device import IDEAL, Device
 from invrender.files.images import Photo
+from invrender.lights import IDEAL, Device
 from invrender.rig import Rig
 
 SIZE = (720, 960)

@@ -19,12 +19,12 @@ from invrender.capture.sheet import (
     use_paper,
     use_sheet,
 )
+from invrender.capture.sheet_layout import capture_sheet
 from invrender.files.capture import Capture
 from invrender.files.images import Photo
 from invrender.lights import Lights
 from invrender.pattern.default import default_pattern
 from invrender.rig import Rig
-from invrender.sheet import capture_sheet
 from invrender.types import InputError
 
 RIG = Rig()

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from invrender.device import Device
 from invrender.files.capture import load_set
 from invrender.files.rig_toml import write_rig
 from invrender.files.write import write_exr
+from invrender.lights import Device
 from invrender.rig import Rig
 from invrender.types import InputError
 

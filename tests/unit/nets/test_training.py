@@ -11,9 +11,9 @@ torch = pytest.importorskip("torch")
 from safetensors.numpy import load_file, save_file  # noqa: E402
 
 from invrender.data.materials import augment  # noqa: E402
-from invrender.device import IDEAL  # noqa: E402
 from invrender.files.maps import write_maps  # noqa: E402
 from invrender.files.write import write_exr  # noqa: E402
+from invrender.lights import IDEAL  # noqa: E402
 from invrender.maps import constant_maps  # noqa: E402
 from invrender.pattern.default import block_pattern  # noqa: E402
 from invrender.tasks import map_tasks  # noqa: E402

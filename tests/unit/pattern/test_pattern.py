@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 from rich.console import Console
 
+from invrender.capture.sheet_layout import capture_sheet, marker_dictionary
 from invrender.cli.pattern import add_parser
 from invrender.data.environments import procedural_environment
 from invrender.data.tablets import TABLETS, find_tablet
@@ -41,7 +42,6 @@ from invrender.pattern.guide import _guide, _sheet, needed_focal
 from invrender.pattern.sets import pattern_set
 from invrender.rig import Rig
 from invrender.sampling import resize_pattern
-from invrender.sheet import capture_sheet, marker_dictionary
 from invrender.sphere import scale_environment
 from invrender.types import InputError
 

@@ -9,6 +9,7 @@ from PIL import ImageColor
 from invrender.capture.lights import FoundLights
 from invrender.capture.mirror import make_ball
 from invrender.capture.sheet import FoundSheet
+from invrender.capture.sheet_layout import capture_sheet
 from invrender.files.capture import Capture
 from invrender.files.images import Photo
 from invrender.lights import Lights
@@ -16,7 +17,6 @@ from invrender.pattern.default import default_pattern
 from invrender.report.advice import WANTED, advice
 from invrender.report.inspection import COLOURS, INSET, annotate, deviations
 from invrender.rig import Rig
-from invrender.sheet import capture_sheet
 
 RIG = Rig()
 SIZE = (1500, 2000)

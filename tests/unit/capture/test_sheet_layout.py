@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from invrender.rig import Rig
-from invrender.sheet import (
+from invrender.capture.sheet_layout import (
     BALL_CLEAR,
     INK_REFLECTANCE,
     PAPER,
@@ -17,6 +16,7 @@ from invrender.sheet import (
     draw_sheet,
     marker_dictionary,
 )
+from invrender.rig import Rig
 from invrender.types import InputError
 
 RIGS = [

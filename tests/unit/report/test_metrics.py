@@ -6,7 +6,6 @@ import sys
 import numpy as np
 import pytest
 
-from invrender import metrics
 from invrender.cli import compare as compare_cli
 from invrender.cli.main import main
 from invrender.data import EXAMPLE
@@ -14,6 +13,7 @@ from invrender.files.maps import read_maps, write_maps
 from invrender.files.write import write_exr, write_png
 from invrender.maps import constant_maps
 from invrender.render.point_lights import grid_lights, relight, rerender
+from invrender.report import metrics
 from invrender.rig import Rig
 from invrender.types import InputError
 
