@@ -21,6 +21,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
+from safetensors.torch import load_file
 from scipy import fft
 from scipy.ndimage import map_coordinates
 from torch import Tensor
@@ -42,7 +43,7 @@ LOWEST_Z = -0.95  # of a direction on Lambert's disc, whose border is -1
 GOLDEN = (5**0.5 - 1) / 2  # steps of an even sequence on the circle
 LEAST_SCREEN_COS = 0.02  # between a ray and the screen's axis: 89 degrees
 LEAST_N_V = 1e-3  # n·v of a normal that looks away from the camera
-BRDF_TABLE = Path(__file__).with_name("weights") / "brdf_table.npy"
+BRDF_TABLE = Path(__file__).with_name("weights") / "brdf_table.safetensors"
 FAR = 1e3  # coordinates that are outside any image
 
 
@@ -180,7 +181,7 @@ def area_resize(image: Array, size: int) -> Array:
 @cache
 def brdf_table() -> Tensor:
     """`compute_brdf_table`'s, as a file holds it: computing it takes a quarter of a second."""
-    return torch.from_numpy(np.load(BRDF_TABLE))
+    return load_file(BRDF_TABLE)["brdf"]
 
 
 def compute_brdf_table(size: int = 32, samples: int = 4096) -> NDArray[np.float32]:

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import json
 import os
-import pickle
 import re
 import secrets
 import shutil
@@ -24,6 +23,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from invrender.app.kept import read_found, write_found
 from invrender.data import EXAMPLE
 from invrender.files.images import PHOTOS
 from invrender.files.write import atomic_path, write_exr
@@ -226,22 +226,20 @@ def keep(folder: Path, number: int, sources: dict[str, Any], found: Any) -> None
     """Keep what was found in a photo, where the disk has room; `kept` brings it back."""
     places = folder.parents[1] / "kept"
     with suppress(OSError):
-        with atomic_path(places / f"{folder.name}-{number}") as path, path.open("wb") as out:
-            pickle.dump((sources, found), out, protocol=pickle.HIGHEST_PROTOCOL)
+        with atomic_path(places / f"{folder.name}-{number}") as path:
+            write_found(path, sources, found)
         for old in sorted(places.iterdir(), key=os.path.getmtime)[:-MOST_KEPT]:
             old.unlink(missing_ok=True)
 
 
 def kept(folder: Path, number: int) -> Any:
     """What was found in a photo since the program began; None where there is none, or where its
-    `sources` have changed. `prepare` empties the folder, so that nothing is unpickled that this
-    program did not write."""
+    `sources` have changed. `prepare` empties the folder."""
+    path = folder.parents[1] / "kept" / f"{folder.name}-{number}"
     try:
-        with (folder.parents[1] / "kept" / f"{folder.name}-{number}").open("rb") as file:
-            then, found = pickle.load(file)
-    except (OSError, EOFError, pickle.UnpicklingError):
+        return read_found(path, sources(folder, number))
+    except (OSError, ValueError):
         return None
-    return found if then == sources(folder, number) else None
 
 
 def discard(root: Path, id: str) -> None:

@@ -506,7 +506,7 @@ class ClippedLamps:
     channel_deviation: float = 0.25
     # Deviation of the log gain from which the screen is measured by the table too; by what that is
     # multiplied where some of the screen is saturated; and of the channels, in that; by hand.
-    known_gain: float = 0.05
+    known_gain: float = 0.1
     gain_doubt: float = 3.0
     channel_doubt: float = 0.5
     # The table is believed where its errors with another gain are so small, in logarithms; by hand.

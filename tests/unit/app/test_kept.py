@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from invrender.app import store, work
+from invrender.app.kept import read_found, write_found
 
 
 class Reached(Exception):
@@ -34,6 +35,18 @@ def test_lights_are_found_once(tmp_path, monkeypatch):
     assert looked == [] and given[0].capture.name == "Example"
     np.testing.assert_array_equal(given[0].lights.environment, first.lights.environment)
     np.testing.assert_array_equal(given[0].capture.photo.image, first.capture.photo.image)
+    # Nothing is lost on the way through a file.
+    path = tmp_path / "kept" / "again"
+    write_found(path, 1, first)
+    again = read_found(path, 1)
+    assert again.notices == first.notices and again.ball == first.ball
+    assert again.capture.rig == first.capture.rig and again.lights.fit == first.lights.fit
+    assert again.capture.unknown == first.capture.unknown
+    assert read_found(path, 2) is None
+    path.write_bytes(b"not such a file")
+    with pytest.raises(ValueError, match="does not hold"):
+        read_found(path, 1)
+    path.unlink()
 
     store.update(folder, fixes={"1": {"turn": 2}})
     with pytest.raises(Reached):
@@ -54,7 +67,7 @@ def test_what_is_kept_is_bounded_and_discarded(tmp_path):
     folder = store.folder_of(tmp_path, id)
     sources = store.sources(folder, 1)
     for number in range(1, store.MOST_KEPT + 4):
-        store.keep(folder, number, sources, number)
+        store.keep(folder, number, sources, {"number": number})
     assert len(list((tmp_path / "kept").iterdir())) == store.MOST_KEPT
     store.discard(tmp_path, id)
     assert list((tmp_path / "kept").iterdir()) == []

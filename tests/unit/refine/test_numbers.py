@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from invrender.maps import constant_maps
-from invrender.refine import lobes, posterior, several, shared
+from invrender.refine import lobes, pixels, posterior, several, shared
 from invrender.refine.checks import photo_error
 from invrender.refine.evidence import ODDS_SCALE, compress
 from invrender.refine.flat import diffuse_rest
@@ -154,7 +154,7 @@ def test_deviations_for_several_photos():
     theta = to_theta(constant_maps(1, 2, 0.3, 0.04, 0.5))
     theta[0, 1, S] = 0.6
     s = several.TOGETHER
-    sigma = several._deviations(theta, np.full((1, 2), 0.07, np.float32), s)
+    sigma = pixels.wide_deviations(theta, np.full((1, 2), 0.07, np.float32), s)
     np.testing.assert_allclose(sigma[0, 0], [0.3] * 3 + [0.01] * 3 + [0.07] + [0.6] * 2, rtol=1e-5)
     np.testing.assert_allclose(sigma[0, 1], [0.01] * 3 + [0.3] * 3 + [0.07] + [0.6] * 2, rtol=1e-5)
 
