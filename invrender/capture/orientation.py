@@ -254,10 +254,14 @@ def likeness(seen: Array, shown: Array, white: Array) -> float:
     """Correlation in [-1, 1] of two images (n, n, 3), each channel about its own mean and spread.
 
     What is seen is saturated from ``white`` (3,) on; as much of what is ``shown`` counts as that.
+    The brightest few cells of both count as equal: a lamp beside the screen's edge may be seen in
+    them.
     """
     saturated = (seen >= ORIENTATION.saturated * white).mean((0, 1))
-    tops = [np.quantile(shown[..., c], 1 - saturated[c]) for c in range(3)]
-    shown = np.minimum(shown, tops)
+    share = np.minimum(1 - saturated, 1 - ORIENTATION.brightest)
+    seen, shown = (
+        np.minimum(a, [np.quantile(a[..., c], share[c]) for c in range(3)]) for a in (seen, shown)
+    )
     a, b = (x.reshape(-1, 3) - x.reshape(-1, 3).mean(0) for x in (seen, shown))
     spread = a.std(0) * b.std(0)
     least = ORIENTATION.least_spread * np.abs(seen).mean() * np.abs(shown).mean()

@@ -286,6 +286,7 @@ class Orientation:
     flat: float = 0.05  # standard deviation of a pattern without sides to tell; by hand
     least_spread: float = 1e-3  # of the means' product, of a channel that counts; by hand
     saturated: float = 0.98  # of white, beside which a look-up of a saturated pixel lies; by hand
+    brightest: float = 0.05  # share of cells whose brightness does not count; by hand
     telling: float = 0.2  # share of the screen that must not be white to tell the pattern; by hand
 
 

@@ -18,8 +18,8 @@ from invrender.capture.mirror import (
     outline_points,
     place_ball,
 )
-from invrender.capture.orientation import find_ball_and_orientation
-from invrender.capture.settings import BALL_SEARCH
+from invrender.capture.orientation import find_ball_and_orientation, likeness
+from invrender.capture.settings import BALL_SEARCH, ORIENTATION
 from invrender.capture.table import room_irradiance
 from invrender.colour import linear_to_srgb
 from invrender.files.capture import Capture, load_capture
@@ -27,6 +27,7 @@ from invrender.files.images import Photo, read_photo
 from invrender.files.rig_toml import write_rig
 from invrender.files.write import write_exr
 from invrender.rig import Rig
+from invrender.sampling import resize_pattern
 from invrender.sphere import directions, irradiance
 from invrender.types import InputError
 
@@ -324,6 +325,17 @@ def test_a_screen_that_is_nearly_all_white_is_not_another_pattern():
     assert here.pattern is PATTERN and not notices
     assert off(ball, true_ball())[0] < 0.05
     assert measure_lights(here, ball, 32).fit["saturated"] > 0.7
+
+
+@pytest.mark.parametrize("white", [np.inf, 1.0])
+def test_a_lamp_beside_the_screen_leaves_the_pattern_alike(white):
+    """It shines into two cells, forty times as bright as the screen."""
+    shown = resize_pattern(PATTERN, ORIENTATION.cells)
+    seen = 2.0 * shown
+    seen[-1, 15:17] = [70, 57, 38]
+    seen, level = np.minimum(seen, white), np.full(3, white)
+    assert likeness(seen, shown, level) > 0.95
+    assert likeness(seen, np.rot90(shown), level) < 0.5
 
 
 def test_a_tilt_that_the_rig_tells_is_kept(tilted):
