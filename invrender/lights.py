@@ -96,7 +96,8 @@ class Lights:
     camera's in pixels, ``pixels`` the number used, ``saturated`` and ``room_saturated`` the shares
     of screen and room in the ball that are saturated, ``room_raised`` how many times brighter the
     saturated lamps were made, ``gain_by_table`` by what the ball's gain was multiplied, by the
-    table's shading, ``hidden_lamp`` how many times brighter than the filling a part of
+    table's shading, ``vignetting`` the share of light that the lens loses in the photo's corners,
+    which was undone, ``hidden_lamp`` how many times brighter than the filling a part of
     the room behind the screen was made (1: none), ``pattern_residual`` the residual before the
     screen's pose and curve were fitted, ``screen_shift`` (metres) and ``screen_tilt`` (degrees) how
     far the screen is found from its place, ``camera_tilt`` how far the camera is found to look past

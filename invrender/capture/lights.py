@@ -22,6 +22,7 @@ from invrender.capture.response import Response
 from invrender.capture.screen import Screen, fit_screen
 from invrender.capture.settings import PATTERN_CHECK, SCREEN_FIT, TABLE_LEVEL, UNFOLDING
 from invrender.capture.sheet import FoundSheet, moved_circle, undone, use_paper, use_sheet
+from invrender.capture.vignetting import find_vignetting, without_vignetting
 from invrender.files.capture import Capture
 from invrender.files.images import Photo
 from invrender.lights import Lights
@@ -97,6 +98,8 @@ def find_lights(
             mirror = (*mirror, Notice("photo-curve", CURVE_TEXT))
             sheet = undone(sheet, response)
         lights, paper = use_paper(sheet, lights, found)
+        if share := lights.fit["vignetting"]:
+            capture = replace(capture, photo=without_vignetting(capture.photo, share))
     if environment is not None:
         lights = replace(lights, environment=environment)
     if gain is not None:
@@ -194,6 +197,10 @@ def _measure(
     fit["gain_by_table"] = float(factor.mean())
     lit = capture.pattern, gain, screen.device
     environment = fill_environment(environment, coverage)
+    fit["vignetting"] = 0.0
+    if fit["room_raised"] == 1 and screen.saturated <= SCREEN_FIT.saturated:  # the light is known
+        fit["vignetting"] = find_vignetting(photo, rig, ball, lit, environment)
+        photo = without_vignetting(photo, fit["vignetting"])
     environment, fit["hidden_lamp"] = add_hidden_lamp(photo, rig, ball, lit, environment, coverage)
     size = min(PATTERN_CHECK.captured_size, max(capture.pattern.shape[:2]))
     captured = unfold_pattern(photo, rig, ball, size)
@@ -280,6 +287,12 @@ def light_warnings(lights: Lights) -> tuple[Notice, ...]:
             "expose shorter, or take a raw photo, to know"
         )
         notices.append(Notice("room-saturated", text))
+    if fit.get("vignetting", 0) > 0:
+        text = (
+            f"the lens loses {fit['vignetting']:.0%} of the light in the photo's corners, by the "
+            "table's shading; that was undone: use the camera's own lens correction if it has one"
+        )
+        notices.append(Notice("photo-vignetting", text))
     if fit.get("hidden_lamp", 1) > 1:
         text = (
             "the table's shading shows that there is a lamp behind the screen, which the ball does "

@@ -519,6 +519,17 @@ class ClippedLamps:
 
 
 @dataclass(frozen=True)
+class Vignetting:
+    """What a lens loses towards the corners: `invrender.capture.vignetting`."""
+
+    most: float = 0.6  # share of light that corners lack; by hand
+    steps: int = 61
+    # Errors of the table's log brightness with it, at most, and over those without; by hand.
+    plain: float = 0.06
+    ratio: float = 0.75
+
+
+@dataclass(frozen=True)
 class HiddenLamp:
     """A lamp behind the screen: `invrender.capture.hidden_lamp`."""
 
@@ -572,5 +583,6 @@ PATTERN_CHECK = PatternCheck()
 UNFOLDING = Unfolding()
 TABLE_METER = TableMeter()
 CLIPPED_LAMPS = ClippedLamps()
+VIGNETTING = Vignetting()
 HIDDEN_LAMP = HiddenLamp()
 CROP = Crop()

@@ -1,0 +1,70 @@
+"""What a lens loses towards the corners, by the table: a raw file may hold it, and no file says so.
+
+The light on the table is known once the lights are, up to its albedo. Where its radiance falls off
+from the photo's middle more than that light does, and nothing else is left to explain, the lens is
+the cause: a factor 1/(1 + c·r²)², with r = 1 in the corners, as the fourth power of a cosine falls.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from invrender.capture.mirror import Ball
+from invrender.capture.robust import spread
+from invrender.capture.settings import TABLE_METER, VIGNETTING
+from invrender.capture.table import distant_pairs, lit_table
+from invrender.files.images import Photo
+from invrender.lights import Device
+from invrender.rig import Rig
+from invrender.types import TINY, Array
+
+
+def find_vignetting(
+    photo: Photo, rig: Rig, ball: Ball, screen: tuple[Array, Array, Device], environment: Array
+) -> float:
+    """The share of light that the photo's corners lack; 0 where the table does not show it.
+
+    The screen: pattern (h, w, 3), gain (3,) and display; environment: (H, 2H, 3), filled.
+    Logarithms of the table's radiance some blocks apart are compared, as in
+    `invrender.capture.clipped_lamps`, in brightness. The table is believed where that explains
+    nearly all of its shading, and much more than without.
+    """
+    seen, at, use, lit, room = lit_table(photo, rig, ball, screen, environment)
+    pairs = [pair for pair, _ in distant_pairs(use)]
+    if not pairs:
+        return 0.0
+    albedo = (seen - np.log(np.maximum(lit + room, TINY))).mean(-1)
+    aside = squared_distance(photo, rig.project(at, photo.height, photo.width))
+
+    def spreads(v: float) -> float:
+        log = albedo + np.log(lens_gain(v, aside))
+        return float(np.median([spread(log[i] - log[j]) for i, j in pairs]))
+
+    tried = np.linspace(0, VIGNETTING.most, VIGNETTING.steps)
+    left = [spreads(v) for v in tried]
+    best = int(np.argmin(left))
+    least = max(left[best], TABLE_METER.least_spread)
+    told = least < VIGNETTING.plain and least < VIGNETTING.ratio * left[0]
+    return float(tried[best]) if told else 0.0
+
+
+def squared_distance(photo: Photo, pixels: Array) -> Array:
+    """That of pixels (..., 2) from the photo's middle, 1 in the corners."""
+    half = np.array([photo.width, photo.height]) / 2
+    return np.asarray(((pixels - half) ** 2).sum(-1) / (half**2).sum())
+
+
+def without_vignetting(photo: Photo, share: float) -> Photo:
+    """The photo as brightened towards its corners; what is saturated stays so."""
+    x, y = np.arange(photo.width) + 0.5, np.arange(photo.height) + 0.5
+    aside = squared_distance(photo, np.stack(np.broadcast_arrays(x, y[:, None]), -1))
+    image = photo.image * lens_gain(share, aside)[..., None]
+    return replace(photo, image=image.astype(np.float32))
+
+
+def lens_gain(share: float, aside: Array) -> Array:
+    """By what radiance must be multiplied where a lens's corners lack a ``share`` of the light, at
+    squared distances ``aside`` from the middle."""
+    return np.asarray((1 + (1 / np.sqrt(1 - share) - 1) * aside) ** 2)
