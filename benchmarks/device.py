@@ -62,7 +62,13 @@ SILENT = {"raw": 0.02, "bracket": 0.02, "jpeg": 0.05}
 SPOILT = 2.0  # times the ideal error: to be warned of
 FALSE_TILT = 0.5  # degrees, of a camera that is straight
 # Notices that say what was measured, not that something is wrong.
-TELLS = {"ball-reflectance-measured", "fov-measured", "pattern-turned", "photo-turned", "photo-vignetting"}
+TELLS = {
+    "ball-reflectance-measured",
+    "fov-measured",
+    "pattern-turned",
+    "photo-turned",
+    "photo-vignetting",
+}
 NOISY = 0.02  # of the photographs of a straight camera, relative
 
 Row = dict[str, Any]
