@@ -20,7 +20,7 @@ WHOLE = 256  # pixels of the longer side at which a sample is judged as a whole
 COARSE = 128  # pixels of the longer side at which the correction was trained
 # Of the guided filter, by hand: pixels a side of its window; deviation of the photo's logarithm
 # that tells nothing; what is added to the photo before, of its mean; n·z of the steepest normal.
-GUIDE_SIZE, GUIDE_NOISE, DARK, STEEPEST = 5, 0.03, 0.02, 0.1
+GUIDE_SIZE, GUIDE_NOISE, DARK, STEEPEST_SLOPE = 5, 0.03, 0.02, 0.1
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,9 @@ def enlarged(whole: Prediction, photo: Array) -> Prediction:
 
     maps = whole.maps
     normal = np.ones((height, width, 3), np.float32)
-    normal[..., :2] = detailed(maps.normal[..., :2] / np.maximum(maps.normal[..., 2:], STEEPEST))
+    normal[..., :2] = detailed(
+        maps.normal[..., :2] / np.maximum(maps.normal[..., 2:], STEEPEST_SLOPE)
+    )
     maps = Maps(
         np.clip(detailed(maps.diffuse), 0, 1),
         np.clip(detailed(maps.specular), 0, 1),

@@ -23,7 +23,7 @@ EXPONENTS = (0.9, 1.0, 1.1)
 ACES_EXPOSURES = (0.5, 1.0, 2.0)  # light at which that curve is cut off
 # Logarithms: by how much a camera's curve differs from all members, independently at each knot.
 OTHERWISE = 0.03
-DARKEST, COUNT = 1e-3, 400  # light at which a curve starts, white being 1; values of its table
+LEAST_LIGHT, COUNT = 1e-3, 400  # light at which a curve starts, white being 1; values of its table
 
 
 def members(light: Array) -> Array:
@@ -44,7 +44,7 @@ def members(light: Array) -> Array:
 def curve_prior(knots: Array, fixed: int) -> tuple[Array, Array]:
     """Mean (k,) and covariance (k, k) of log light over value, where the file's value is one of the
     ``knots`` (k,), in units in which both are equal at the ``fixed`` one."""
-    light = np.geomspace(DARKEST, 1, COUNT)
+    light = np.geomspace(LEAST_LIGHT, 1, COUNT)
     rows = []
     for values in members(light):
         log = np.interp(np.log(knots), np.log(values), np.log(light)) - np.log(knots)

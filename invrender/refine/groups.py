@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from invrender.types import Array
 
-ROUNDS = 30  # of Lloyd's algorithm, which settles within 20
+GROUPING_ROUNDS = 30  # of Lloyd's algorithm, which settles within 20
 
 
 def group(points: Array, count: int) -> tuple[Array, NDArray[np.intp]]:
@@ -28,7 +28,7 @@ def group(points: Array, count: int) -> tuple[Array, NDArray[np.intp]]:
             break
         axis = np.linalg.eigh(off[of].T @ off[of])[1][:, -1]
         label[of] = np.where(off[of] @ axis > 0, len(scatter), widest)
-    for _ in range(ROUNDS):
+    for _ in range(GROUPING_ROUNDS):
         centres = _means(points, label)
         nearest = _nearest(points, centres)
         if (nearest == label).all():
