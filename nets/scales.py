@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter
 
 from invrender.maps import Estimate, Maps, resize_maps, unit_normals
 from invrender.refine.lobes import Lobes
@@ -122,5 +122,8 @@ def enlarged(whole: Prediction, photo: Array) -> Prediction:
 
 def _around(image: Array) -> Array:
     """Means over the square around each pixel of (H, W, ...)."""
-    size = (GUIDE_SIZE, GUIDE_SIZE, *(1 for _ in image.shape[2:]))
-    return np.asarray(uniform_filter(image, size, mode="nearest"))
+    from kornia.filters import box_blur
+
+    planes = torch.from_numpy(image.reshape(*image.shape[:2], -1)).permute(2, 0, 1)[None]
+    blurred = box_blur(planes, GUIDE_SIZE, border_type="replicate", separable=True)
+    return blurred[0].permute(1, 2, 0).numpy().reshape(image.shape)

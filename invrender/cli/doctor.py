@@ -20,7 +20,7 @@ OPTIONAL = {
     "distributed": "a Dask cluster (cluster)",
 }
 REQUIRED = (
-    "invrender", "drjit", "mitsuba", "torch", "numpy", "scipy", "scikit-image", "OpenEXR",
+    "invrender", "drjit", "mitsuba", "torch", "kornia", "numpy", "scipy", "scikit-image", "OpenEXR",
     "pillow",
 )  # fmt: skip
 

@@ -7,7 +7,7 @@ import time
 import pytest
 
 HEAVY = {
-    "torch", "drjit", "mitsuba", "matplotlib", "scipy", "skimage", "numpy", "PIL",
+    "torch", "kornia", "drjit", "mitsuba", "matplotlib", "scipy", "skimage", "numpy", "PIL",
     "OpenEXR", "jinja2", "rich", "cv2", "nets",
 }  # fmt: skip
 HELP = "import runpy, sys; sys.argv[1:] = ['--help']; runpy.run_module('invrender')"
@@ -61,6 +61,7 @@ def test_small_parts_load_small_parts():
     )
     assert not set(eval(run(code))) & {
         "torch",
+        "kornia",
         "drjit",
         "mitsuba",
         "matplotlib",
