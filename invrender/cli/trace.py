@@ -16,12 +16,23 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from invrender.files.output import check_output
+from invrender.files.write import atomic_path
+from invrender.types import InputError
+
 EVERY = 0.005  # seconds between samples; a trace of a run has some megabytes
 
 
 @contextmanager
 def traced(path: Path) -> Iterator[None]:
-    """Sample the calling thread while the block runs, and write its trace, also after an error."""
+    """Sample the calling thread while the block runs, and write its trace, also after an error.
+
+    Raises `InputError`, before the block runs, where ``path`` is no .json file that can be written:
+    no input is one.
+    """
+    if path.suffix.lower() != ".json":
+        raise InputError(f"{path}: the trace is a JSON file; give it a name that ends in .json")
+    check_output(path, file=True)
     samples: list[tuple[float, list[str]]] = []
     thread, ended = threading.get_ident(), threading.Event()
 
@@ -38,7 +49,8 @@ def traced(path: Path) -> Iterator[None]:
         sampler.join()
         samples.append((time.perf_counter(), []))
         trace = {"traceEvents": _events(samples), "displayTimeUnit": "ms"}
-        path.write_text(json.dumps(trace), encoding="utf-8")
+        with atomic_path(path) as temporary:
+            temporary.write_text(json.dumps(trace), encoding="utf-8")
 
 
 def _stack(frame: FrameType | None) -> list[str]:

@@ -3,6 +3,9 @@
 import json
 import time
 
+import pytest
+
+from invrender.cli.main import main
 from invrender.cli.trace import traced
 
 
@@ -33,3 +36,13 @@ def test_durations_by_function(tmp_path):
     assert not open_
     assert 0.1 < seconds["busy"] < seconds["outer"]
     assert seconds["outer"] > 0.3
+
+
+@pytest.mark.parametrize("name", ["missing/trace.json", "photo.exr"])
+def test_a_trace_that_cannot_be_written_is_refused_before_the_work(tmp_path, name, capsys):
+    (tmp_path / "photo.exr").write_text("an input")
+    (tmp_path / "missing").write_text("a file, no folder")
+    page = tmp_path / "page.html"
+    assert main(["pattern", "-o", str(page), "--profile", str(tmp_path / name)]) == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+    assert not page.exists() and (tmp_path / "photo.exr").read_text() == "an input"
