@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from invrender.types import Array
+from invrender.types import TINY, Array
 
 
 def resize(image: Array, height: int, width: int) -> Array:
@@ -85,3 +85,11 @@ def knot_slopes(knots: Array) -> tuple[Array, Array]:
     these change by at each inner knot, (k - 2, k)."""
     slopes = np.diff(np.eye(len(knots)), axis=0) / np.diff(knots)[:, None]
     return slopes, np.diff(slopes, axis=0)
+
+
+def parabola_top(values: Array, i: int) -> float:
+    """How far beside its greatest value, at ``i``, a parabola through three has its top."""
+    if not 0 < i < len(values) - 1:
+        return 0.0
+    a, b, c = values[i - 1 : i + 2]
+    return float(0.5 * (a - c) / min(a - 2 * b + c, -TINY))

@@ -23,7 +23,8 @@ from invrender.capture.ball_view import View, view_around
 from invrender.capture.settings import CROPPING, RIM_FIT, SQUARE_FIT
 from invrender.files.images import Photo
 from invrender.rig import Rig
-from invrender.types import TINY, Array, InputError
+from invrender.sampling import parabola_top
+from invrender.types import Array, InputError
 
 
 def is_whole(photo: Photo) -> bool:
@@ -313,15 +314,7 @@ def _best_lines(view: View, ends: Array, reach: float, askew: float, step: float
     peaks = np.argwhere(clear == ndimage.maximum_filter(clear, 9))
     peaks = peaks[np.argsort(-clear[tuple(peaks.T)])][: SQUARE_FIT.best]
     return [
-        np.array([places[j] + step * _top(clear[i], j), slopes[i] + step * _top(clear[:, j], i),
-                  clear[i, j]])
+        np.array([places[j] + step * parabola_top(clear[i], j),
+                  slopes[i] + step * parabola_top(clear[:, j], i), clear[i, j]])
         for i, j in peaks
     ]  # fmt: skip
-
-
-def _top(values: Array, i: int) -> float:
-    """How far beside its greatest value, at ``i``, a parabola through three has its top."""
-    if not 0 < i < len(values) - 1:
-        return 0.0
-    a, b, c = values[i - 1 : i + 2]
-    return float(0.5 * (a - c) / min(a - 2 * b + c, -TINY))

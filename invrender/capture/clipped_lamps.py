@@ -45,31 +45,27 @@ def raise_clipped(
     The screen: pattern (h, w, 3), gain (3,) and display; ``gain_deviation`` is that of the
     logarithm of its gain, by the ball. One factor per channel is found for all clipped texels, and
     where the gain is in doubt one for the screen, the most probable ones under log-normal priors
-    and a Lambertian table: the
-    logarithms of its radiance some way apart are compared, robustly (Cauchy), since textures,
-    papers and shadows have edges, and colour apart from brightness, which varies more. That the
-    screen shades the table from the clipped lamps counts too. 1 where nothing is clipped, and where
-    the gain is known.
+    and a Lambertian table: the logarithms of its radiance some way apart are compared, robustly
+    (Cauchy), since textures, papers and shadows have edges, and colour apart from brightness, which
+    varies more. That the screen shades the table from the clipped lamps counts too. 1 where nothing
+    is clipped, and where the gain is known.
     """
     share = clipped_share(photo, rig, image, len(environment))
-    same = np.ones(3)
-    doubt = CLIPPED_LAMPS.gain_doubt * gain_deviation
     doubted = gain_deviation > CLIPPED_LAMPS.known_gain
     if not (share.any() or doubted):
-        return environment, 1.0, same
+        return environment, 1.0, np.ones(3)
     level = photo.clip_level or 0.0
     extra = np.asarray(share * level / np.asarray(rig.ball_reflectance), np.float32)
     filled = fill_environment(environment, coverage)
     seen, at, use, lit, room = lit_table(photo, rig, image.ball, screen, filled)
     lamps = room_irradiance(rig, at, extra)
     factors = _Factors(seen, use, lit, room, lamps)
-    x, y = factors.fit(0.0)
-    if doubted:
-        tried = factors.fit(doubt)
-        # Textures, and a lamp that the screen hides, spoil the table's word.
-        told = factors.spread(*tried).max() < CLIPPED_LAMPS.plain
-        if told and abs(tried[1].mean()) < CLIPPED_LAMPS.likely_gain * doubt:
-            x, y = tried
+    doubt = CLIPPED_LAMPS.gain_doubt * gain_deviation if doubted else 0.0
+    x, y = factors.fit(doubt)
+    if doubted:  # textures, and a lamp that the screen hides, spoil the table's word
+        told = factors.spread(x, y).max() < CLIPPED_LAMPS.plain
+        if not told or abs(y.mean()) >= CLIPPED_LAMPS.likely_gain * doubt:
+            x, y = factors.fit(0.0)
     factor, gain = np.exp(x), np.exp(y)
     raised = environment + extra * (factor - 1).astype(np.float32)
     return np.asarray(raised, np.float32), float(factor.mean()), gain

@@ -98,8 +98,8 @@ def find_lights(
             mirror = (*mirror, Notice("photo-curve", CURVE_TEXT))
             sheet = undone(sheet, response)
         lights, paper = use_paper(sheet, lights, found)
-        if share := lights.fit["vignetting"]:
-            capture = replace(capture, photo=without_vignetting(capture.photo, share))
+        photo = without_vignetting(capture.photo, lights.fit["vignetting"])
+        capture = replace(capture, photo=photo)
     if environment is not None:
         lights = replace(lights, environment=environment)
     if gain is not None:

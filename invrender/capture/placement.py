@@ -18,6 +18,7 @@ from scipy import ndimage
 from invrender.capture.crop import crop_part, in_photo
 from invrender.files.images import Photo
 from invrender.rig import Rig
+from invrender.sampling import parabola_top
 from invrender.types import TINY, Array, Mask
 
 
@@ -158,15 +159,6 @@ def _best_shift(
     far = (k[:, None] ** 2 + k**2) / s.usual**2
     score = (product / norm).mean(0) - s.doubt * far
     i, j = divmod(int(np.argmax(score)), score.shape[1])
-    row = k[i] + _vertex(score[:, j], i) / (side / 2)
-    column = k[j] + _vertex(score[i], j) / (side / 2)
+    row = k[i] + parabola_top(score[:, j], i) / (side / 2)
+    column = k[j] + parabola_top(score[i], j) / (side / 2)
     return float(score[i, j]), np.array([column, -row])
-
-
-def _vertex(values: Array, at: int) -> float:
-    """Where the parabola through a maximum and its neighbours has its own, from it."""
-    if not 0 < at < len(values) - 1:
-        return 0.0
-    a, b, c = (float(v) for v in values[at - 1 : at + 2])
-    curve = a - 2 * b + c
-    return 0.5 * (a - c) / curve if curve < 0 else 0.0

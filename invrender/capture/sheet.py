@@ -32,6 +32,7 @@ from invrender.capture.sheet_layout import (
     marker_dictionary,
 )
 from invrender.capture.table import room_irradiance, screen_irradiance
+from invrender.capture.vignetting import squared_distance
 from invrender.files.capture import Capture
 from invrender.files.images import Photo
 from invrender.lights import Lights
@@ -187,7 +188,9 @@ def use_sheet(capture: Capture) -> tuple[Capture, FoundSheet | None, tuple[Notic
         residual=residual,
         white=_on_table(white),
         white_radiance=radiance,
-        white_aside=_aside(photo, posed, _on_table(white)),
+        white_aside=squared_distance(
+            photo, posed.project(_on_table(white), photo.height, photo.width)
+        ),
         turns=turns,
     )
     used = replace(
@@ -567,12 +570,6 @@ def _white_radiance(photo: Photo, rig: Rig, white: Array, side: float) -> tuple[
     seen = photo.image[row, column]
     clear = ~photo.clipped[row, column].any(1)
     return white[use][clear], np.median(seen[clear], 1)
-
-
-def _aside(photo: Photo, rig: Rig, points: Array) -> Array:
-    """Squared distances (k,) of points from the photo's middle, a corner's being 1."""
-    off = rig.project(points, photo.height, photo.width) - _middle(photo)
-    return np.asarray((off**2).sum(-1) / (_middle(photo) ** 2).sum())
 
 
 def undone(sheet: FoundSheet | None, response: Response) -> FoundSheet | None:

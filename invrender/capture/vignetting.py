@@ -57,7 +57,10 @@ def squared_distance(photo: Photo, pixels: Array) -> Array:
 
 
 def without_vignetting(photo: Photo, share: float) -> Photo:
-    """The photo as brightened towards its corners; what is saturated stays so."""
+    """The photo as brightened towards its corners, which lack a ``share`` of the light; what is
+    saturated stays so."""
+    if share == 0:
+        return photo
     x, y = np.arange(photo.width) + 0.5, np.arange(photo.height) + 0.5
     aside = squared_distance(photo, np.stack(np.broadcast_arrays(x, y[:, None]), -1))
     image = photo.image * lens_gain(share, aside)[..., None]
