@@ -36,6 +36,7 @@ from benchmarks.common.captures import (
 )
 from benchmarks.common.results import Bar, Table, bar, table, write_results
 from invrender.capture.lights import FoundLights, find_lights
+from invrender.capture.sample import Sample
 from invrender.colour import PRIMARIES, linear_to_srgb, srgb_to_linear, to_rec709
 from invrender.data.simulate import SAMPLE_LEVEL, simulate_real
 from invrender.data.simulate_camera import Camera, seen, toned
@@ -45,7 +46,7 @@ from invrender.files.rig_toml import read_rig
 from invrender.lights import IDEAL, Device, Lights
 from invrender.maps import map_errors, resize_maps
 from invrender.pattern.default import default_pattern
-from invrender.pipeline import Sample, Stages, estimate_maps, reconstruct
+from invrender.pipeline import Stages, estimate_maps, reconstruct
 from invrender.render.path_traced import path_traced, sample_scene
 from invrender.render.renderer import Material
 from invrender.render.scene import make_view

@@ -132,11 +132,13 @@ def answers(capture: HeldOut, batch: Batch, steps: int) -> dict[str, tuple[list[
 
 def refined_maps(capture: HeldOut, estimate: Any) -> Maps:
     """The pipeline's refinement of an estimate, without the learned correction."""
+    from invrender.refine.estimate import observe
     from invrender.refine.posterior import explain
     from invrender.refine.priors import network_prior
     from invrender.refine.shared import share
 
-    observation = capture.sample.observation()
+    sample = capture.sample
+    observation = observe(sample.photo, sample.lights, sample.clipped)
     prior = network_prior(estimate.maps, estimate.sigma)
     known = share([observation], prior)
     return explain(known.observations, known.prior).maps

@@ -24,10 +24,11 @@ from benchmarks.common.captures import OTHERS, PHOTOGRAPHS, arguments, make_capt
 from benchmarks.common.plot import plot_error_over_time
 from benchmarks.common.results import Bar, Table, bar, table, write_results
 from invrender.capture.lights import find_lights
+from invrender.capture.sample import Sample
 from invrender.data import EXAMPLE
 from invrender.files.capture import load_capture
 from invrender.maps import NAMES, Maps, constant_maps, map_errors, resize_maps
-from invrender.pipeline import Sample, Stages, estimate_maps
+from invrender.pipeline import Stages, estimate_maps
 from invrender.refine.checks import coarse_error, photo_error
 from invrender.refine.theta import deviations
 from invrender.render.point_lights import rerender
@@ -112,7 +113,7 @@ def measure(folder: Path, size: int, init: str, noise: float | None = None) -> R
     row: Row = {
         "capture": folder.name,
         "jpeg": capture.photo.clip_level is not None,
-        "seconds_initial": done - stage.seconds["refine"] - stage.seconds.get("materials", 0.0),
+        "seconds_initial": done - stage.seconds["refine"],
         "seconds_refined": done,
         "processor_seconds": cpu,
         "stages": stage.seconds,

@@ -31,10 +31,11 @@ from benchmarks.common.gradients import sample_sensor
 from benchmarks.common.plot import plot_error_over_time
 from benchmarks.common.results import Table, bar, table, write_results
 from invrender.capture.lights import find_lights
+from invrender.capture.sample import Sample
 from invrender.files.capture import load_capture
 from invrender.lights import Lights
 from invrender.maps import Maps, map_errors, resize_maps
-from invrender.pipeline import Sample
+from invrender.refine.estimate import observe
 from invrender.refine.gauss_newton import PHOTO_NOISE, linearise, refine
 from invrender.refine.posterior import SETTINGS, explain
 from invrender.refine.priors import Prior, network_prior
@@ -62,7 +63,8 @@ class Problem:
         found = find_lights(load_capture(folder))
         assert found.capture.truth is not None
         self.lights: Lights = found.lights
-        self.shot = Sample.of(found, n).observation()
+        sample = Sample.of(found, n)
+        self.shot = observe(sample.photo, sample.lights, sample.clipped)
         self.n, self.photo = n, self.shot.photo
         self.truth: Maps = resize_maps(found.capture.truth, n, n)
         self.network = Reconstructor()

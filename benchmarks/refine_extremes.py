@@ -17,11 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.common.results import Bar, bar, benchmark_parser, table, write_results
+from invrender.capture.sample import Sample
 from invrender.data.environments import procedural_environment
 from invrender.lights import Lights
 from invrender.maps import Maps, constant_maps, map_errors
 from invrender.pattern.default import default_pattern
-from invrender.pipeline import Sample, Stages, estimate_maps
+from invrender.pipeline import Stages, estimate_maps
 from invrender.refine.checks import baked_light, coarse_error, photo_error
 from invrender.render import Fast
 from invrender.render.scene import make_scene

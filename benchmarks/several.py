@@ -35,6 +35,7 @@ from benchmarks.common.captures import (
 from benchmarks.common.results import Bar, Table, bar, table, write_results
 from benchmarks.refine import rerender_error
 from invrender.capture.lights import FoundLights, find_lights
+from invrender.capture.sample import Sample
 from invrender.capture.which_pattern import find_pattern
 from invrender.data.simulate_setup import hides
 from invrender.files.capture import Capture, load_capture
@@ -44,7 +45,7 @@ from invrender.files.write import write_exr
 from invrender.lights import Lights
 from invrender.maps import NAMES, Maps, crop_maps, map_errors, resize_maps
 from invrender.pattern.sets import COUNTS, pattern_set
-from invrender.pipeline import Sample, Stages, estimate_maps
+from invrender.pipeline import Stages, estimate_maps
 from invrender.rig import Rig
 from invrender.types import Array, InputError, Vec3
 

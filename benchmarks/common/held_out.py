@@ -13,10 +13,10 @@ import numpy as np
 import torch
 
 from benchmarks.baselines.flash import SIZE, flash_photos
+from invrender.capture.sample import Sample
 from invrender.lights import IDEAL, Device, Lights
 from invrender.maps import Maps, resize_maps
 from invrender.pattern.default import default_pattern
-from invrender.pipeline import Sample
 from invrender.refine.lobes import read_lobes
 from invrender.render.fast.estimator import Fast
 from invrender.render.mis import Mis

@@ -18,10 +18,11 @@ import numpy as np
 
 from benchmarks.common.captures import CaptureSet, make_capture, sample_and_room, true_lights
 from invrender.capture.lights import find_lights
+from invrender.capture.sample import Sample
 from invrender.files.capture import load_capture
 from invrender.maps import map_errors, resize_maps
 from invrender.pattern.default import default_pattern
-from invrender.pipeline import Sample, Stages, estimate_maps
+from invrender.pipeline import Stages, estimate_maps
 from invrender.rig import Rig
 from invrender.types import Array, InputError
 

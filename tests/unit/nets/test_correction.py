@@ -7,11 +7,12 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from invrender.capture.lights import find_lights  # noqa: E402
+from invrender.capture.sample import Sample  # noqa: E402
 from invrender.data import EXAMPLE  # noqa: E402
 from invrender.files.capture import load_capture  # noqa: E402
 from invrender.maps import constant_maps, resize_maps  # noqa: E402
 from invrender.pattern.default import block_pattern  # noqa: E402
-from invrender.pipeline import Sample, Stages, estimate_maps, refine_capture  # noqa: E402
+from invrender.pipeline import Stages, estimate_maps, refine_capture  # noqa: E402
 from invrender.refine.lobes import fit_lobes  # noqa: E402
 from invrender.render import Fast, Material  # noqa: E402
 from invrender.render.scene import make_scene, make_view  # noqa: E402

@@ -1,4 +1,4 @@
-"""What the pipeline itself adds between the stages."""
+"""What a result says of its maps."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import pytest
 from invrender.lights import Lights
 from invrender.maps import Estimate, constant_maps
 from invrender.pattern.default import default_pattern
-from invrender.pipeline import with_mirror_error
+from invrender.report.summary import with_mirror_error
 from invrender.rig import Rig
 
 
