@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from invrender.capture.photos import find_every_light, read_captures, without_photo
 from invrender.capture.lights import FoundLights
+from invrender.capture.photos import find_every_light, read_captures, without_photo
 from invrender.capture.sample import Sample, place_samples
 from invrender.files.output import check_output
 from invrender.maps import Maps
