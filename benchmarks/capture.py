@@ -158,7 +158,7 @@ def main(args: argparse.Namespace) -> None:
         "accepted without a ball": sum("refused" not in r for r in wrong),
         "sample's corners as told, share of a side, median": median("sample told"),
         "sample's corners, share of a side, median": median("sample"),
-        "sample's corners within 1%": float(np.mean([r["sample"] <= 0.01 for r in rows])),
+        "sample's corners within 1%": float(np.mean([r.get("sample", 1) <= 0.01 for r in rows])),
     }
     kinds = {"all": None, "HDR": "hdr", "JPEG": "jpeg"}
     medians = [[e, *(median(n, k) for k in kinds.values())] for n, e in ERRORS.items()]

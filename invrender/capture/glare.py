@@ -42,13 +42,15 @@ def remove_glare(photo: Photo, rig: Rig, image: BallImage) -> Photo:
     if not scale > 0:
         return photo
     inside, outside = ((p - ball.centre) / ball.radius for p in (image.pixels, at[use]))
+    measured = inside[use]
+    some = slice(None, None, max(1, len(measured) // GLARE_FIT.pixels))  # glare is smooth
 
     def glare(p: Array, place: Array) -> Array:
         return np.asarray(np.exp(-((place - p[:2]) ** 2).sum(-1) / p[2] ** 2)[..., None] * p[3:])
 
     def residuals(p: Array) -> Array:
-        expected = glare(p, inside[use]) - reflectance * glare(p, outside)
-        return np.asarray((expected - extra / scale).ravel())
+        expected = glare(p, measured[some]) - reflectance * glare(p, outside[some])
+        return np.asarray((expected - extra[some] / scale).ravel())
 
     def cost(p: Array) -> float:
         return float(np.log1p(residuals(p) ** 2).sum())
@@ -57,7 +59,7 @@ def remove_glare(photo: Photo, rig: Rig, image: BallImage) -> Photo:
     width = GLARE_FIT.start_width
     for angle in np.arange(GLARE_FIT.directions) * (2 * math.pi / GLARE_FIT.directions):
         start = np.array([math.cos(angle), math.sin(angle), width, 0, 0, 0])
-        near = ((inside[use] - start[:2]) ** 2).sum(-1) < width**2
+        near = ((measured - start[:2]) ** 2).sum(-1) < width**2
         if near.any():
             start[3:] = np.maximum(np.median(extra[near], 0) / scale, 0)
             starts.append(start)

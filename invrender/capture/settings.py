@@ -356,6 +356,7 @@ class GlareFit:
     widths: tuple[float, float] = (0.1, 1.0)  # radii; by hand
     farthest: float = 2.0  # radii, of its centre on each axis; by hand
     precision: float = 1e-6  # of the cost; by hand
+    pixels: int = 2000  # of the ball's that are compared, at least, where it has so many; by hand
 
 
 @dataclass(frozen=True)
