@@ -77,6 +77,7 @@ class Device:
 
 
 IDEAL = Device()
+NO_PATTERN: Array = np.zeros((1, 1, 3), np.float32)  # where the rig has no screen
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,7 @@ class Lights:
 
     rig: where screen and camera are. The screen's radiance is ``gain`` (a number or RGB) times
     what ``device`` makes of ``pattern`` (h, w, 3), linear values in [0, 1], row 0 at +y: ``shown``
-    straight ahead, less towards the sides. environment: linear RGB radiance (H, 2H, 3), row 0 at
+    straight ahead, less towards the sides; `NO_PATTERN` of a rig without a screen. environment: linear RGB radiance (H, 2H, 3), row 0 at
     the zenith; zeros, as by default, for a dark room.
 
     What `invrender.find_lights` adds of a photo's mirror ball. coverage: (H, 2H), the share of each
@@ -136,10 +137,8 @@ class Lights:
         half = self.rig.sample_size / 2
         by = turn.apply([*(-half * place[:2, 2] / place[2, 2]), 0.0])
         rig = self.rig.turned(turn, np.zeros(3))
-        rig = replace(
-            rig,
-            screen_shift=tuple(np.add(rig.screen_shift, by).tolist()),
-            camera_shift=tuple(np.add(rig.camera_shift, by).tolist()),
-        )
+        rig = replace(rig, camera_shift=tuple(np.add(rig.camera_shift, by).tolist()))
+        if rig.has_screen:
+            rig = replace(rig, screen_shift=tuple(np.add(rig.screen_shift, by).tolist()))
         room = rotate_environment(self.environment, -angle % (2 * np.pi)) if angle else None
         return replace(self, rig=rig, environment=self.environment if room is None else room)

@@ -34,7 +34,8 @@ def fov_of(tangent: float) -> float:
 class Rig:
     """Sizes in metres, angles in degrees. The defaults are a tablet and a 19 mm ball.
 
-    ``screen_size``: of the lit area, a square's side or (along x, along y). ``sample_side``: of the
+    ``screen_size``: of the lit area, a square's side or (along x, along y); None where there is no
+    screen, and then ``sample_side`` and ``camera_height`` must be given. ``sample_side``: of the
     square sample, by default half of the screen's shorter side. ``screen_bezel``: width of the
     black border around the lit area, which hides what is behind. ``camera_height``: by default the
     screen's. ``ball_shape``: a "hemisphere" lies on its flat side, a "sphere" stands on the table.
@@ -46,7 +47,7 @@ class Rig:
         print(rig.sample_size)
     """
 
-    screen_size: float | tuple[float, float] = 0.18
+    screen_size: float | tuple[float, float] | None = 0.18
     screen_height: float = 0.153
     camera_offset: float = 0.017
     ball_radius: float = 0.0095
@@ -69,7 +70,11 @@ class Rig:
         for name, value in values.items():
             if not np.all(np.isfinite(value)):
                 raise InputError(f"rig: {name} must be finite")
-        if np.shape(self.screen_size) not in ((), (2,)):
+        if self.screen_size is None and None in (self.sample_side, self.camera_height):
+            raise InputError(
+                "rig: without a screen the sample's size and the camera's height must be given"
+            )
+        if self.screen_size is not None and np.shape(self.screen_size) not in ((), (2,)):
             raise InputError("rig: screen_size must be one number or two")
         for name in ("screen_size", "ball_radius", "sample_side", "camera_height"):
             least = float(np.min(values.get(name, 1.0)))
@@ -84,7 +89,9 @@ class Rig:
         if not self.camera_offset >= 0:
             raise InputError(f"rig: camera offset must not be negative, got {self.camera_offset:g}")
         lengths = [value for name, value in values.items() if name.endswith(_LENGTHS)]
-        shortest = min(*self.screen_sides, self.screen_height, self.ball_radius, self.sample_size)
+        shortest = min(self.screen_height, self.ball_radius, self.sample_size)
+        if self.has_screen:
+            shortest = min(*self.screen_sides, shortest)
         if any(np.abs(v).max() > LONGEST for v in lengths) or shortest < 1 / LONGEST:
             raise InputError(
                 f"rig: lengths must lie between {1 / LONGEST:g} and {LONGEST:g}; use metres"
@@ -97,9 +104,10 @@ class Rig:
             raise InputError(f"rig: fov must be between 1 and 170 degrees, got {self.fov:g}")
         if not all(0 < r <= 1 for r in self.ball_reflectance):
             raise InputError("rig: ball reflectance must be above 0 and at most 1")
-        corner, (e_x, e_y) = self.screen_body
-        if corner[2] + min(e_x[2], 0) + min(e_y[2], 0) <= 0:
-            raise InputError("rig: the tilted screen reaches below the table")
+        if self.has_screen:
+            corner, (e_x, e_y) = self.screen_body
+            if corner[2] + min(e_x[2], 0) + min(e_y[2], 0) <= 0:
+                raise InputError("rig: the tilted screen reaches below the table")
 
     # --- the sample -----------------------------------------------------------------------------
 
@@ -126,9 +134,16 @@ class Rig:
     # --- the screen -----------------------------------------------------------------------------
 
     @property
+    def has_screen(self) -> bool:
+        """Whether there is a screen; without one nothing else of it may be asked for."""
+        return self.screen_size is not None
+
+    @property
     def screen_sides(self) -> tuple[float, float]:
         """Width (along x) and depth (along y) of the screen's lit area."""
         size = self.screen_size
+        if size is None:
+            raise ValueError("the rig has no screen")
         wide, deep = (size[0], size[1]) if isinstance(size, (tuple, list)) else (size, size)
         return float(wide), float(deep)
 
@@ -168,8 +183,10 @@ class Rig:
 
         From ``points`` (..., 3) that face up, below the screen's front; (..., cells, cells), row 0
         at the pattern's top. Times a pattern's radiance and summed it is the irradiance. falloff:
-        the display's (`invrender.lights.Device`), times cos(θ')^falloff.
+        the display's (`invrender.lights.Device`), times cos(θ')^falloff. Noughts without a screen.
         """
+        if not self.has_screen:
+            return np.zeros((*np.shape(points)[:-1], cells, cells))
         e_x, e_y = self.screen_edges
         t = (np.arange(cells) + 0.5) / cells
         middle = self.screen_corner + t[:, None] * e_x + (1 - t)[:, None, None] * e_y
@@ -213,8 +230,6 @@ class Rig:
 
     def turned(self, turn: Rotation, centre: Array) -> Rig:
         """Camera and screen turned about a point (3,); the ball's nominal place stays."""
-        e_x, e_y = self.screen_edges
-        screen = self.screen_corner + e_x / 2 + e_y / 2
 
         def moved(shift: Vec3, at: Array) -> Any:
             return tuple((shift + centre + turn.apply(at - centre) - at).tolist())
@@ -223,12 +238,19 @@ class Rig:
             both = turn * Rotation.from_rotvec(tilt, degrees=True)
             return tuple(both.as_rotvec(degrees=True).tolist())
 
-        return replace(
+        rig = replace(
             self,
-            screen_shift=moved(self.screen_shift, screen),
-            screen_tilt=tilted(self.screen_tilt),
             camera_shift=moved(self.camera_shift, self.camera),
             camera_tilt=tilted(self.camera_tilt),
+        )
+        if not self.has_screen:
+            return rig
+        e_x, e_y = self.screen_edges
+        screen = self.screen_corner + e_x / 2 + e_y / 2
+        return replace(
+            rig,
+            screen_shift=moved(self.screen_shift, screen),
+            screen_tilt=tilted(self.screen_tilt),
         )
 
     def focal(self, photo_width: int) -> float:

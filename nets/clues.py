@@ -9,6 +9,7 @@ the screen; they are smooth and noiseless, so a coarse grid over the sample serv
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -106,16 +107,17 @@ def light_inputs(
     sky (9, ·, ·), screen (6, ·, ·), ball (3, ·, ·), pattern (3, ·, ·), rig (12,).
     """
     gain = np.broadcast_to(np.asarray(gain, np.float32), 3)
+    nominal = rig if rig.has_screen else _with_screen(rig)
     if not (np.any(pattern > 0) and np.any(gain > 0)):
         pattern, gain = np.ones((16, 16, 3), np.float32), np.zeros(3, np.float32)
     lit = device.shown(pattern) * gain
-    scene = make_scene(rig, pattern, None, gain, device=device)
+    scene = make_scene(nominal, pattern, None, gain, device=device)
     active, slopes = plane_clues(scene, size, samples)
     out = {
         "active_clues": active,
-        "screen": _levels(prefilter_screen(lit, CLUE_RHO, _relative_height(rig))),
+        "screen": _levels(prefilter_screen(lit, CLUE_RHO, _relative_height(nominal))),
         "pattern": area_resize(lit if captured is None else captured, PATTERN_SIZE),
-        "rig": pack_rig(rig),
+        "rig": pack_rig(nominal),
     }
     if environment is not None and environment[: len(environment) // 2].any():
         # A screen without gain still hides what is behind it.
@@ -134,6 +136,11 @@ def light_inputs(
         k: np.ascontiguousarray(np.moveaxis(v, -1, 0) if v.ndim == 3 else v, np.float32)
         for k, v in out.items()
     }
+
+
+def _with_screen(rig: Rig) -> Rig:
+    """With the screen that its sample and its camera would belong to."""
+    return replace(rig, screen_size=2 * rig.sample_size, screen_height=float(rig.camera[2]))
 
 
 def _levels(stack: Array) -> Array:

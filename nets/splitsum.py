@@ -55,6 +55,8 @@ def mask_environment(environment: Array, rig: Rig) -> Array:
     the table."""
     d = directions(*environment.shape[:2]).astype(np.float64)
     hidden = d[..., 2] <= 0
+    if not rig.has_screen:
+        return np.where(hidden[..., None], 0, environment).astype(np.float32)
     corner, (e_x, e_y) = rig.screen_body
     m = np.cross(e_x, e_y)
     half = rig.sample_size / 2

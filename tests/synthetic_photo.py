@@ -57,6 +57,8 @@ def light_from(
 ) -> Any:
     """Radiance arriving along upward directions: the screen if it is hit, else the sky."""
     out = environment(d)
+    if not rig.has_screen:
+        return out
     e_x, e_y = rig.screen_edges
     n = np.cross(e_x, e_y)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -50,6 +50,8 @@ class BallImage:
 
     def screen(self, rig: Rig) -> Mask:
         """(h, w): pixels that see the screen, or its bezel, and so not the room."""
+        if not rig.has_screen:
+            return np.zeros_like(self.visible)
         return self.visible & _meet(*rig.screen_body, self.point, self.mirrored)[2]
 
 

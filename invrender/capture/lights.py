@@ -25,7 +25,7 @@ from invrender.capture.sheet import FoundSheet, moved_circle, undone, use_paper,
 from invrender.capture.vignetting import find_vignetting, without_vignetting
 from invrender.files.capture import Capture
 from invrender.files.images import Photo
-from invrender.lights import Lights
+from invrender.lights import IDEAL, NO_PATTERN, Lights
 from invrender.rig import Rig
 from invrender.types import Array, InputError, Notice
 
@@ -62,8 +62,8 @@ def find_lights(
 
     ball: its circle in the photo, x, y, radius in pixels, where it is given by hand. environment:
     the room's radiance (H, 2H, 3) in the photo's unit, linear RGB, if it is known; zeros for a dark
-    room. gain: the screen's radiance for a white pattern, likewise, a number or RGB. With both, no
-    ball is looked for. Raises `InputError` where no ball is found, or where it does not show the
+    room. gain: the screen's radiance for a white pattern, likewise, a number or RGB. With both, or
+    with the room of a rig without a screen, no ball is looked for. Raises `InputError` where no ball is found, or where it does not show the
     pattern.
 
         capture = load_capture("my-capture")
@@ -74,6 +74,8 @@ def find_lights(
         photo = capture.photo
         capture, sheet, sheet_notices = use_sheet(capture)
         ball = moved_circle(sheet, ball, photo, capture.photo)
+    if not capture.rig.has_screen:
+        gain = 0.0
     if environment is not None and gain is not None:
         if sheet is None:
             capture = replace(capture, rig=find_camera(capture.photo, capture.rig)[0])
@@ -174,6 +176,8 @@ def _measure(
     rig = level_table(capture.photo, capture.rig, ball)
     image = trace_image(rig, ball)
     photo = remove_glare(capture.photo, rig, image)
+    if not rig.has_screen:
+        return _measure_room(capture, photo, rig, image, height), None
     screen = fit_screen(photo, rig, image, capture.pattern, capture.device, curve=curve)
     lit = capture.pattern, screen.gain, screen.device
     fit = _fit_numbers(screen, rig)
@@ -184,9 +188,7 @@ def _measure(
         or fit["screen_tilt"] > PATTERN_CHECK.least_tilt
     ):
         rig = screen.rig
-    fit["ball_reflectance"] = float(np.mean(rig.ball_reflectance))
-    known = "ball_reflectance" not in capture.unknown
-    fit["ball_reflectance_deviation"] = 0.0 if known else ball.reflectance_deviation or 0.0
+    fit |= _mirror_numbers(capture, rig, ball)
     fit["room_saturated"] = _room_saturated(photo, rig, image)
     environment, coverage = unfold_environment(photo, rig, image, height, screen.blur)
     environment, fit["room_raised"], factor = raise_clipped(
@@ -206,6 +208,30 @@ def _measure(
     captured = unfold_pattern(photo, rig, ball, size)
     lights = Lights(rig, capture.pattern, environment, gain, coverage, captured, fit, screen.device)
     return lights, screen.response
+
+
+def _measure_room(
+    capture: Capture, photo: Photo, rig: Rig, image: BallImage, height: int
+) -> Lights:
+    """The lights of a rig without a screen: the environment, all of which the ball shows."""
+    fit = {"camera_tilt": rig.off_nadir, "vignetting": 0.0}
+    fit |= _mirror_numbers(capture, rig, image.ball)
+    fit["room_saturated"] = _room_saturated(photo, rig, image)
+    environment, coverage = unfold_environment(photo, rig, image, height)
+    environment, fit["room_raised"], _ = raise_clipped(
+        photo, rig, image, (NO_PATTERN, np.zeros(3), IDEAL), environment, coverage
+    )
+    environment = fill_environment(environment, coverage)
+    return Lights(rig, NO_PATTERN, environment, np.zeros(3, np.float32), coverage, None, fit)
+
+
+def _mirror_numbers(capture: Capture, rig: Rig, ball: Ball) -> dict[str, float]:
+    """The numbers of `Lights.fit` that tell the mirror's reflectance."""
+    known = "ball_reflectance" not in capture.unknown
+    return {
+        "ball_reflectance": float(np.mean(rig.ball_reflectance)),
+        "ball_reflectance_deviation": 0.0 if known else ball.reflectance_deviation or 0.0,
+    }
 
 
 def level_table(photo: Photo, rig: Rig, ball: Ball) -> Rig:

@@ -43,6 +43,8 @@ def find_ball_and_orientation(
     fallback: tuple[Capture, Ball, float] | None = None
     problem: InputError | None = None
     photo = capture.photo
+    if not capture.rig.has_screen:
+        return _find_ball_alone(capture, manual)
     # As it is; then with the field of view taken to be across the photo's other side.
     for first in (0, 1) if manual is None and photo.height != photo.width else (0,):
         nominal = replace(capture, photo=turned_photo(photo, first))
@@ -92,6 +94,36 @@ def find_ball_and_orientation(
     if manual is None and expected < ORIENTATION.unlike and has_sides:
         raise not_the_pattern(ball)
     return here, ball, ()
+
+
+def _find_ball_alone(
+    capture: Capture, manual: Circle | None
+) -> tuple[Capture, Ball, tuple[Notice, ...]]:
+    """As `find_ball_and_orientation`, without a screen: the first of the photo's quarter turns in
+    which there are the ball and, beside it, the sample's square or the capture sheet; the photo as
+    it is where none shows both."""
+    photo, first = capture.photo, None
+    problem: InputError | None = None
+    for turn in range(4 if manual is None and capture.tilt_deviation is None else 1):
+        rig = turned_rig(capture.rig, (photo.height, photo.width), turn)
+        here = replace(capture, photo=turned_photo(photo, turn), rig=rig)
+        here, tilt_deviation = posed(here)
+        clear = tilt_deviation < SQUARE_FIT.unseen_tilt
+        if turn and not clear:
+            continue
+        try:
+            here, ball = find_either_ball(here, manual, tilt_deviation)
+        except InputError as error:
+            problem = problem or error
+            continue
+        if clear:
+            ball = replace(ball, camera_tilt=None, tilt_deviation=None)
+            return here, ball, _notices(turn, 0, False)
+        first = here, ball, ()
+    if first is None:
+        assert problem is not None
+        raise _explained(problem, capture) from None
+    return first
 
 
 def _check_uncropped(capture: Capture, ball: Ball) -> None:

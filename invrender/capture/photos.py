@@ -11,7 +11,7 @@ import numpy as np
 
 from invrender.capture.lights import FoundLights, find_lights
 from invrender.capture.which_pattern import find_pattern
-from invrender.files.capture import Capture, load_capture, load_set, set_patterns
+from invrender.files.capture import Capture, holds_set, load_capture, load_set
 from invrender.types import Array, InputError, Notice
 
 # A capture, and the patterns of which its photo shows one; none where it is known which.
@@ -19,8 +19,8 @@ Shown = tuple[Capture, list[Array]]
 
 
 def read_captures(folder: Path) -> list[Shown]:
-    """A folder's captures: one, or as many as its set of patterns has photos."""
-    if folder.is_dir() and set_patterns(folder):
+    """A folder's captures: one, or as many as there are photos in a set."""
+    if folder.is_dir() and holds_set(folder):
         captures, patterns = load_set(folder)
         return [(c, patterns) for c in captures]
     return [(load_capture(folder), [])]

@@ -640,7 +640,7 @@ def use_paper(
             f"{1 / ratio:.0%} of its size (the line in its window tells) or [ball] radius is wrong"
         )
         notices.append(Notice("sheet-scale", text))
-    measured = screen_gain(sheet, lights)
+    measured = screen_gain(sheet, lights) if lights.rig.has_screen else None
     if measured is None:
         return lights, tuple(notices)
     gain, deviation = measured

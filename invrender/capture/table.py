@@ -86,6 +86,8 @@ def distant_pairs(use: Mask) -> list[tuple[tuple[Any, Any], int]]:
 def hidden_by_screen(rig: Rig, points: Array, direction: Array) -> Mask:
     """Whether the screen, or its bezel, hides each of the directions (m, 3) from each of the points
     (n, 3)."""
+    if not rig.has_screen:
+        return np.zeros((len(points), len(direction)), bool)
     corner, (e_x, e_y) = rig.screen_body
     normal = np.cross(e_x, e_y)
     from_corner = np.asarray(points) - corner

@@ -42,7 +42,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     import numpy as np
 
     from invrender.capture.lights import find_lights
-    from invrender.files.capture import Capture, check_photo, load_capture, set_patterns
+    from invrender.files.capture import Capture, check_photo, holds_set, load_capture
     from invrender.files.images import read_photo
     from invrender.files.output import check_output
     from invrender.files.rig_toml import FOUND_IN_PHOTO
@@ -53,7 +53,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
     if args.out is not None:
         check_output(args.out, [args.capture], megabytes=PICTURE_MEGABYTES)
-    if args.capture.is_dir() and set_patterns(args.capture):
+    if args.capture.is_dir() and holds_set(args.capture):
         return _inspect_set(args, console)
     if args.capture.is_dir():
         capture = load_capture(args.capture)
@@ -73,7 +73,6 @@ def run(args: argparse.Namespace, console: Console) -> int:
     found = find_lights(capture, ball=args.ball)
     capture, ball, lights = found.capture, found.ball, found.lights
     assert ball is not None and lights.coverage is not None
-    assert lights.pattern_captured is not None
     numbers = summary(found)
     if args.out is not None:
         args.out.mkdir(parents=True, exist_ok=True)
@@ -81,7 +80,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
             annotate(found).save(path, format="PNG", compress_level=1)
         write_exr(args.out / "environment.exr", lights.environment)
         write_exr(args.out / "coverage.exr", lights.coverage)
-        write_exr(args.out / "pattern_captured.exr", lights.pattern_captured)
+        if lights.pattern_captured is not None:
+            write_exr(args.out / "pattern_captured.exr", lights.pattern_captured)
     if args.json:
         print(json.dumps(numbers))
         return 0
@@ -109,12 +109,17 @@ def run(args: argparse.Namespace, console: Console) -> int:
         + ("given by hand" if args.ball else f"confidence {ball.confidence:.2f}")
         + f"; reflects {np.mean(lights.rig.ball_reflectance):.0%}"
         + within("ball_reflectance", " % of that", 100),
-        f"screen  radiance of white {gain}{within(gained, '%', 100)}; pattern fits to "
-        f"{fit['residual']:.1%}, display's gamma {fit['gamma']:.2f}, {fit['saturated']:.0%} "
-        f"saturated",
-        f"room    {numbers['coverage']:.0%} of the sky seen, {numbers['room_saturated']:.1%} of it "
-        f"saturated; the pattern gives {numbers['pattern_share']:.0%} of the light on the sample",
     ]
+    room = f"{numbers['coverage']:.0%} of the sky seen, {numbers['room_saturated']:.1%} of it "
+    room += "saturated"
+    if lights.rig.has_screen:
+        lines.append(
+            f"screen  radiance of white {gain}{within(gained, '%', 100)}; pattern fits to "
+            f"{fit['residual']:.1%}, display's gamma {fit['gamma']:.2f}, {fit['saturated']:.0%} "
+            "saturated"
+        )
+        room += f"; the pattern gives {numbers['pattern_share']:.0%} of the light on the sample"
+    lines.append(f"room    {room}")
     if "paper_gain" in fit:
         lines.append(
             f"paper   {fit['paper_gain']:.2f} times the light that the ball explains"
@@ -130,7 +135,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 
 def _inspect_set(args: argparse.Namespace, console: Console) -> int:
-    """What each photo under a set of patterns shows, a line each; what is left out, and why."""
+    """What each photo of a set shows, a line each; what is left out, and why."""
     from invrender.capture.lights import find_lights
     from invrender.capture.which_pattern import find_pattern
     from invrender.files.capture import load_set
@@ -145,12 +150,15 @@ def _inspect_set(args: argparse.Namespace, console: Console) -> int:
     for capture in captures:
         name = capture.name.split("/")[-1]
         try:
-            shown, which = find_pattern(capture, patterns)
-            found = find_lights(shown)
+            which = None
+            if patterns:
+                capture, which = find_pattern(capture, patterns)
+            found = find_lights(capture)
         except InputError as error:
             photos[name] = {"left_out": str(error)}
             continue
-        photos[name] = {"pattern": which + 1, **summary(found)}
+        shown = {} if which is None else {"pattern": which + 1}
+        photos[name] = {**shown, **summary(found)}
         if args.out is not None:
             args.out.mkdir(parents=True, exist_ok=True)
             with atomic_path(args.out / f"inspect_{name}.png") as path:
@@ -161,12 +169,16 @@ def _inspect_set(args: argparse.Namespace, console: Console) -> int:
         if "left_out" in told:
             console.print(f"{name}  left out: {told['left_out']}")
             continue
-        gain = ", ".join(f"{g:.3g}" for g in told["gain"])
-        console.print(
-            f"{name}  pattern {told['pattern']} of {len(patterns)}, ball with confidence "
-            f"{told['ball_confidence']:.2f}, radiance of white {gain}, pattern fits to "
-            f"{told['fit']['residual']:.1%}"
-        )
+        text = f"{name}  ball with confidence {told['ball_confidence']:.2f}"
+        if "pattern" in told:
+            gain = ", ".join(f"{g:.3g}" for g in told["gain"])
+            text += (
+                f", pattern {told['pattern']} of {len(patterns)}, radiance of white {gain}, "
+                f"pattern fits to {told['fit']['residual']:.1%}"
+            )
+        else:
+            text += f", {told['room_saturated']:.1%} of the room saturated"
+        console.print(text)
         for warning in told["warnings"]:
             console.print(f"  warning: {warning['text']}")
     if all("left_out" in told for told in photos.values()):

@@ -10,6 +10,9 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 
+LAMP_PHOTOS, MOST_PHOTOS = 6, 40  # without a tablet
+
+
 def add_parser(commands: Any) -> None:
     """Add the subcommand to argparse's subparsers."""
     parser = commands.add_parser(
@@ -40,6 +43,11 @@ def add_parser(commands: Any) -> None:
     real.add_argument("--sheet", action="store_true", help="with the printed capture sheet")
     real.add_argument("--sphere", action="store_true", help="a whole ball")
     real.add_argument("--camera-height", type=float, metavar="METRES", help="above the table")
+    alone = parser.add_argument_group("without a tablet")
+    alone.add_argument(
+        "--no-screen", action="store_true", help="a lamp that is moved about lights the sample"
+    )
+    alone.add_argument("--photos", type=int, help="so many, each under its own lamp (6)")
     parser.set_defaults(run=run)
 
 
@@ -47,9 +55,10 @@ def run(args: argparse.Namespace, console: Console) -> int:
     from invrender.data.environments import procedural_environment, read_environment
     from invrender.data.materials import procedural_material, read_material
     from invrender.data.simulate import simulate, simulate_real
-    from invrender.data.simulate_setup import draw_setup
+    from invrender.data.simulate_setup import draw_lamps, draw_setup, without_screen
     from invrender.files.images import read_image
     from invrender.files.output import check_output
+    from invrender.lights import NO_PATTERN
     from invrender.maps import resize_maps
     from invrender.pattern.default import default_pattern
     from invrender.rig import Rig
@@ -58,6 +67,11 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
     if args.size < 1 or args.width < 64 or args.spp < 1:
         raise InputError("sizes and sample counts must be positive, the photo 64 pixels or wider")
+    if args.no_screen and (args.pattern or args.exposures not in (None, 1)):
+        raise InputError("--no-screen has neither a pattern nor a bracket of exposures")
+    if args.photos is not None and not (args.no_screen and 1 <= args.photos <= MOST_PHOTOS):
+        raise InputError(f"--photos is for --no-screen, 1 to {MOST_PHOTOS}")
+    photos = (args.photos or LAMP_PHOTOS) if args.no_screen else 0
     setup = None
     if args.device == "real":
         setup = draw_setup(
@@ -67,13 +81,14 @@ def run(args: argparse.Namespace, console: Console) -> int:
             sheet=args.sheet,
             sphere=args.sphere or None,
             camera_height=args.camera_height,
+            lamps=photos,
         )
     elif args.exposures or args.sheet or args.sphere or args.camera_height is not None:
         raise InputError(
             "--exposures, --sheet, --sphere and --camera-height belong to --device real"
         )
     given = [path for path in (args.maps, args.environment, args.pattern) if path]
-    check_output(args.out, given, megabytes=20e-6 * args.width**2 + 5)
+    check_output(args.out, given, megabytes=20e-6 * args.width**2 * max(photos, 1) + 5)
     if args.maps:
         maps = resize_maps(read_material(args.maps), args.size, args.size)
     else:
@@ -84,12 +99,15 @@ def run(args: argparse.Namespace, console: Console) -> int:
         environment = procedural_environment(args.seed, 256)
     environment = scale_environment(environment, args.irradiance)
     pattern = read_image(args.pattern) if args.pattern else default_pattern()
+    rig = Rig()
+    if args.no_screen:
+        pattern, rig = NO_PATTERN, without_screen(rig)
     with console.status("path tracing …"):
         quality: dict[str, Any] = {"width": args.width, "spp": args.spp, "seed": args.seed}
         if setup is None:
             simulate(
-                args.out, maps, environment, pattern, Rig(),
-                gain=args.gain, noise=args.noise, **quality,
+                args.out, maps, environment, pattern, rig,
+                gain=args.gain, noise=args.noise, lamps=draw_lamps(args.seed, photos), **quality,
             )  # fmt: skip
         else:
             simulate_real(args.out, maps, environment, pattern, setup, **quality)

@@ -6,7 +6,7 @@ import json
 import math
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from invrender.data.simulate_camera import developed, seen, to_jpeg
-from invrender.data.simulate_setup import Setup
+from invrender.data.simulate_setup import Lamp, Setup
 from invrender.files.maps import write_maps
 from invrender.files.rig_toml import FOUND_IN_PHOTO, write_rig
 from invrender.files.write import write_exr
@@ -43,6 +43,7 @@ def simulate(
     noise: float = 0.0,
     seed: int = 0,
     device: Device = IDEAL,
+    lamps: Sequence[Lamp] = (),
 ) -> None:
     """Path-trace a capture of a material and write it as a new folder, whole or not at all.
 
@@ -50,7 +51,8 @@ def simulate(
     values that ``device`` shows; rig: metres and degrees; gain: radiance of the pattern's white;
     width: of the 4:3 photo; noise: of the sensor, relative to a pixel's value at the photo's 99th
     percentile (shot noise). A rig that is shifted or tilted makes the photo, but ``rig.toml`` gives
-    the nominal one, as a person would; the true one and the device go to ``truth/rig.toml``. Raises
+    the nominal one, as a person would; the true one and the device go to ``truth/rig.toml``. lamps:
+    a photo for each, photo_1.exr and so on. Raises
     `InputError` for a folder that is not empty. `simulate_real` draws all that real set-ups have.
 
         invrender.simulate("new", maps, room, default_pattern(), Rig(), gain=2.0, noise=0.005)
@@ -59,20 +61,21 @@ def simulate(
     from invrender.render.path_traced import photograph
 
     with _new_capture(folder) as new:
-        photo = photograph(
-            rig, maps, pattern, environment, gain, height=width * 3 // 4, width=width, spp=spp,
-            seed=seed, device=device,
-        )  # fmt: skip
-        if noise > 0:
-            rng = np.random.default_rng(seed)
-            level = max(float(np.percentile(photo, 99)), 1e-12)
-            sigma = noise * np.sqrt(np.maximum(photo, 0) * level)
-            photo = np.maximum(photo + sigma * rng.standard_normal(photo.shape), 0)
+        rng = np.random.default_rng(seed)
+        for k, lamp in enumerate(lamps or [None]):
+            photo = photograph(
+                rig, maps, pattern, environment, gain, height=width * 3 // 4, width=width, spp=spp,
+                seed=seed + k, device=device, lamp=lamp,
+            )  # fmt: skip
+            if noise > 0:
+                level = max(float(np.percentile(photo, 99)), 1e-12)
+                sigma = noise * np.sqrt(np.maximum(photo, 0) * level)
+                photo = np.maximum(photo + sigma * rng.standard_normal(photo.shape), 0)
+            write_exr(new / (f"photo_{k + 1}.exr" if lamps else "photo.exr"), photo, half=True)
         still = (0.0, 0.0, 0.0)
         nominal = replace(
             rig, screen_shift=still, screen_tilt=still, camera_shift=still, camera_tilt=still
         )
-        write_exr(new / "photo.exr", photo, half=True)
         write_rig(new / "rig.toml", nominal, "pattern.exr", "truth/")
         _write_truth(new, maps, pattern, environment, rig, device)
 
@@ -105,17 +108,17 @@ def simulate_real(
         units = []
         for k, for_what in enumerate(setup.exposures):
             rig = setup.rig_of(k)
-            light = _light(setup, rig, maps, environment, pattern, width, spp, seed + k)
+            light = _light(setup, rig, maps, environment, pattern, width, spp, seed, k)
             light = seen(camera, light, height, width)
             exposure = _exposure(light, rig, for_what)
             values = developed(camera, light, exposure, rng, clip=setup.photos != "raw")
             units.append(exposure)
+            name = f"photo_{k + 1}" if len(setup.exposures) > 1 else "photo"
             if setup.photos == "raw":
-                write_exr(new / "photo.exr", values, half=True)
+                write_exr(new / f"{name}.exr", values, half=True)
                 continue
-            name = "photo.jpg" if setup.photos == "jpeg" else f"photo_{k + 1}.jpg"
             blob = to_jpeg(camera, values, setup.nominal.fov, exposure / units[0])
-            (new / name).write_bytes(blob)
+            (new / f"{name}.jpg").write_bytes(blob)
         unit = units[0]
         write_rig(new / "rig.toml", setup.nominal, "pattern.exr", "truth/", leave=FOUND_IN_PHOTO)
         _write_truth(new, maps, pattern, environment * unit, setup.rig, setup.device)
@@ -126,9 +129,9 @@ def simulate_real(
 
 def _light(
     setup: Setup, rig: Rig, maps: Maps, environment: Array, pattern: Array, width: int, spp: int,
-    seed: int,
+    seed: int, k: int,
 ) -> Array:  # fmt: skip
-    """Radiance at the photo's pixels and around them, as `seen` takes it."""
+    """Radiance at photo k's pixels and around them, as `seen` takes it."""
     from invrender.capture.sheet_layout import capture_sheet, draw_sheet
     from invrender.render.path_traced import photograph
 
@@ -141,8 +144,8 @@ def _light(
         cover = draw_sheet(sheet, SHEET_PIXELS), sheet.page
     return photograph(
         replace(rig, fov=fov), maps, pattern, environment, setup.gain, height=high, width=wide,
-        spp=spp, seed=seed, device=setup.device, ball=setup.ball, ball_alpha=setup.ball_alpha,
-        cover=cover, table=setup.table,
+        spp=spp, seed=seed + k, device=setup.device, ball=setup.ball, ball_alpha=setup.ball_alpha,
+        cover=cover, table=setup.table, lamp=setup.lamps[k] if setup.lamps else None,
     )  # fmt: skip
 
 
@@ -183,7 +186,8 @@ def _new_capture(folder: str | Path) -> Iterator[Path]:
 def _write_truth(
     new: Path, maps: Maps, pattern: Array, environment: Array, rig: Rig, device: Any
 ) -> None:
-    write_exr(new / "pattern.exr", pattern, half=True)
+    if rig.has_screen:
+        write_exr(new / "pattern.exr", pattern, half=True)
     write_rig(new / "truth" / "rig.toml", rig, device=device)
     write_maps(new / "truth", maps, half=True, width=rig.sample_size)
     write_exr(new / "truth" / "environment.exr", environment, half=True)

@@ -5,6 +5,7 @@ Each quantity has random numbers of its own, so that one more option leaves the 
 
 from __future__ import annotations
 
+import math
 import zlib
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
@@ -17,6 +18,7 @@ from invrender.lights import IDEAL, Device
 from invrender.rig import Rig, fov_of
 from invrender.types import Array, InputError, Vec3
 
+Lamp = tuple[Vec3, float, Vec3]  # as `invrender.render.path_traced` has it
 PHOTO_KINDS = ("raw", "bracket", "jpeg")
 
 
@@ -58,6 +60,10 @@ RANGES = {
     "camera_tilt": Range(-2.0, 2.0, "hand: camera's tilt about each axis, degrees"),
     "shake": Range(-0.001, 0.001, "hand: the same between two exposures, metres"),
     "shake_tilt": Range(-0.3, 0.3, "hand: and degrees"),
+    "lamp_distance": Range(0.4, 1.5, "lamp: from the sample, metres", True),
+    "lamp_angle": Range(20.0, 65.0, "lamp: from straight above, degrees"),
+    "lamp_radius": Range(0.02, 0.15, "lamp: from a bulb to a flash on a card, metres", True),
+    "lamp_light": Range(1.0, 6.0, "lamp: irradiance (the room's is 0.5)", True),
     "measured": Range(-0.002, 0.002, "person: error of measured height and offset, metres"),
     "measured_fov": Range(0.99, 1.01, "person: factor on the field of view"),
     "distortion": Range(-0.03, 0.02, "lens: displacement of a corner, relative"),
@@ -77,6 +83,7 @@ PHOTO_MARGIN = 0.9  # of the photo's half width, that sample and ball reach
 CLEARANCE = 0.006  # metres by which a display stays out of the camera's view before a hand moves it
 FOCUS = 0.15  # metres; main cameras of phones focus no nearer
 ON_ITS_MARK = 0.25  # of the ball's displacement, where the sheet shows its place
+LARGEST_LAMP = 0.5  # radius of a lamp, of its height
 STEP = 0.002  # metres by which the camera moves away until the display leaves its view
 
 
@@ -88,7 +95,8 @@ class Setup:
     display's white. ball: its centre in the world, metres; ball_alpha: its roughness. table: RGB
     albedo. sheet: whether the printed capture sheet lies on it. photos: "raw", "bracket" or "jpeg";
     exposures: of each photo, by what it is exposed for: "sample", "middle" or "screen". shakes: by
-    how much the camera moves from the first photo to each, (metres, degrees).
+    how much the camera moves from the first photo to each, (metres, degrees). lamps: of a set-up
+    without a screen one for each photo.
     """
 
     rig: Rig
@@ -103,6 +111,7 @@ class Setup:
     photos: str = "raw"
     exposures: tuple[str, ...] = ("screen",)
     shakes: tuple[tuple[Vec3, Vec3], ...] = (((0.0,) * 3, (0.0,) * 3),)
+    lamps: tuple[Lamp, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -126,13 +135,15 @@ def draw_setup(
     sheet: bool = False,
     sphere: bool | None = None,
     camera_height: float | None = None,
+    lamps: int = 0,
 ) -> Setup:
     """A set-up as people build it; the same seed gives the same one.
 
     photos: "raw" (linear EXR that no lens correction has seen), "bracket" (JPEGs of so many
     ``exposures``) or "jpeg" (one, exposed for the sample or in the middle between it and the
     display in the ball). sphere: whether the ball is one, drawn if None; camera_height: metres,
-    where the camera's lens is to follow from it. Raises `InputError` where no lens does.
+    where the camera's lens is to follow from it. lamps: so many photos without a screen instead,
+    each exposed for the sample under a lamp of its own, the camera held anew. Raises `InputError` where no lens does.
     """
     draw = _Draw(seed)
     rig = _geometry(draw, sphere, camera_height)
@@ -160,19 +171,47 @@ def draw_setup(
     ball = rig.ball_centre + moved * (ON_ITS_MARK if sheet else 1.0)
     named = {"raw": ("screen",), "jpeg": (("sample", "middle")[draw.share("exposure") < 0.5],)}
     bracket = ("sample", "screen") if exposures == 2 else ("sample", "middle", "screen")
-    for_what = named.get(photos, bracket)
+    for_what = ("sample",) * lamps if lamps else named.get(photos, bracket)
     still = (0.0, 0.0, 0.0)
+    shift, turn = ("camera_shift", "camera_tilt") if lamps else ("shake", "shake_tilt")
     shakes = [
-        (draw.rgb("shake", 3 * k), draw.rgb("shake_tilt", 3 * k)) if k else (still, still)
+        (draw.rgb(shift, 3 * k), draw.rgb(turn, 3 * k)) if k else (still, still)
         for k in range(len(for_what))
     ]
     gain, tint = draw("gain"), draw.rgb("gain_rgb")
     table, paint = draw("table"), draw.rgb("gain_rgb", 3)
+    if lamps:
+        rig, nominal = without_screen(rig), without_screen(nominal)
     return Setup(
         rig, nominal, _device(draw), _vec3(gain * np.array(tint)), _vec3(ball),
         draw("ball_alpha"), _vec3(np.minimum(table * np.array(paint), 0.9)), sheet, camera,
-        photos, for_what, tuple(shakes),
+        photos, for_what, tuple(shakes), draw_lamps(seed, lamps),
     )  # fmt: skip
+
+
+def without_screen(rig: Rig) -> Rig:
+    """The rig without its screen."""
+    height = rig.screen_height if rig.camera_height is None else rig.camera_height
+    return replace(
+        rig, screen_size=None, sample_side=rig.sample_size, screen_height=height,
+        camera_height=height, screen_bezel=0.0,
+    )  # fmt: skip
+
+
+def draw_lamps(seed: int, count: int) -> tuple[Lamp, ...]:
+    """A lamp that is moved about the sample: centre, radius and radiance of each photo's."""
+    draw = _Draw(seed)
+    lamps: list[Lamp] = []
+    for k in range(count):
+        distance, angle = draw("lamp_distance", k), math.radians(draw("lamp_angle", k))
+        around = 2 * math.pi * (k + draw.share("lamp_around", k)) / count
+        out = distance * math.sin(angle)
+        centre = out * math.cos(around), out * math.sin(around), distance * math.cos(angle)
+        radius = min(draw("lamp_radius", k), LARGEST_LAMP * centre[2])
+        # Of a sphere E = π L (r / d)² cos θ, wholly above the horizon.
+        level = draw("lamp_light", k) / (math.pi * (radius / distance) ** 2 * math.cos(angle))
+        lamps.append((centre, radius, (level, level, level)))
+    return tuple(lamps)
 
 
 class _Draw:
@@ -252,6 +291,8 @@ def hides(rig: Rig, clearance: float = 0.0) -> bool:
     edge of the ball from the camera."""
     ball = rig.ball_centre + rig.ball_radius * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0]])
     points = np.concatenate([rig.sample_corners, ball])
+    if not rig.has_screen:
+        return False
     corner, (e_x, e_y) = rig.screen_body
     normal = np.cross(e_x, e_y)
     d = points - rig.camera

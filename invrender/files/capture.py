@@ -11,19 +11,21 @@ import numpy as np
 from invrender.files.images import PHOTOS, Photo, read_image, read_photo
 from invrender.files.maps import read_maps
 from invrender.files.rig_toml import RigFile, read_rig
-from invrender.lights import IDEAL, Device
+from invrender.lights import IDEAL, NO_PATTERN, Device
 from invrender.maps import Maps
 from invrender.rig import Rig
 from invrender.types import Array, InputError, Notice
 
 MIN_PHOTO = 64
+PATTERN_FILES = "pattern.exr", "pattern.png"
 
 
 @dataclass(frozen=True)
 class Capture:
     """One capture: a photo of the set-up, linear RGB, with its rig and the pattern that was shown.
 
-    ``pattern`` (h, w, 3) is what the display was given, linear values in [0, 1], row 0 at +y; where
+    ``pattern`` (h, w, 3) is what the display was given, linear values in [0, 1], row 0 at +y
+    (`invrender.lights.NO_PATTERN` where the rig has no screen); where
     rig.toml tells the display's curve, black and mixing, they are in it. ``device`` is the dimming
     to the sides that rig.toml tells, for lights that are given; the ball shows it else. ``name`` is
     that of its folder.
@@ -52,7 +54,8 @@ class Capture:
 def load_capture(folder: str | Path) -> Capture:
     """Read a capture folder: ``photo.*``, ``rig.toml``, the pattern, and the truth if there is any.
 
-    ``photo_1.*``, ``photo_2.*`` are exposures of one set-up, and are merged.
+    ``photo_1.*``, ``photo_2.*`` are exposures of one set-up, and are merged; without a screen each
+    has its own light, and `load_set` reads them.
 
     Raises `InputError`, one sentence, for anything missing, damaged or out of range.
 
@@ -63,6 +66,11 @@ def load_capture(folder: str | Path) -> Capture:
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder")
     paths = find_photos(folder)
+    if holds_set(folder):
+        raise InputError(
+            f"{folder} holds {len(paths)} photos, each under its own light: 'invrender refine' "
+            "takes them together"
+        )
     photos = [read_photo(path) for path in paths]
     for photo, path in zip(photos, paths, strict=True):
         check_photo(photo, str(path))
@@ -72,9 +80,18 @@ def load_capture(folder: str | Path) -> Capture:
 
         photo = merge_bracket(photos, [p.name for p in paths])
     given = read_rig(folder / "rig.toml", fov=photo.fov)
-    pattern_path = _inside(folder, given.files.get("pattern") or _find_pattern(folder))
-    pattern = _read_pattern(pattern_path, given.device or IDEAL)
+    pattern = _read_own_pattern(folder, given)
     return _capture(photo, given, pattern, folder.resolve().name, *_read_truth(folder, given))
+
+
+def _read_own_pattern(folder: Path, given: RigFile) -> Array:
+    """The pattern of a folder of one; a rig without a screen has none."""
+    if given.rig.has_screen:
+        path = _inside(folder, given.files.get("pattern") or _find_pattern(folder))
+        return _read_pattern(path, given.device or IDEAL)
+    if any((folder / name).is_file() for name in PATTERN_FILES):
+        raise InputError(f"{folder} has a pattern, but its rig.toml no [screen]; add it")
+    return NO_PATTERN
 
 
 def _read_pattern(path: Path, device: Device) -> Array:
@@ -107,8 +124,8 @@ def _capture(
 
 
 def load_set(folder: str | Path) -> tuple[list[Capture], list[Array]]:
-    """Read a folder of photos under a set of patterns: the captures, and the patterns of which each
-    shows one.
+    """Read a folder of photos under a set of patterns, or each under its own light without a screen:
+    the captures, and the patterns of which each shows one.
 
     Its patterns are ``pattern_1.*``, ``pattern_2.*`` and so on, and its photos ``photo_1.*`` and so
     on, in any order. Every capture has the first pattern until `invrender.capture.which_pattern`
@@ -125,9 +142,20 @@ def load_set(folder: str | Path) -> tuple[list[Capture], list[Array]]:
         if truth is None:  # all photos are of one sample, under one display
             truth = _read_truth(folder, given)
             patterns = [_read_pattern(p, given.device or IDEAL) for p in names]
+            pattern = patterns[0] if patterns else _read_own_pattern(folder, given)
         name = f"{folder.resolve().name}/{path.stem}"
-        captures.append(_capture(photo, given, patterns[0], name, *truth))
+        captures.append(_capture(photo, given, pattern, name, *truth))
     return captures, patterns
+
+
+def holds_set(folder: Path) -> bool:
+    """Whether a folder's photos show several patterns, or each its own light without a screen."""
+    if set_patterns(folder):
+        return True
+    rig = folder / "rig.toml"
+    if len(find_photos(folder)) == 1 or not rig.is_file():
+        return False
+    return not read_rig(rig).rig.has_screen
 
 
 def set_patterns(folder: Path) -> list[Path]:
@@ -182,7 +210,7 @@ def _inside(folder: Path, name: str) -> Path:
 
 
 def _find_pattern(folder: Path) -> str:
-    for name in ("pattern.exr", "pattern.png"):
+    for name in PATTERN_FILES:
         if (folder / name).is_file():
             return name
     raise InputError(f"{folder} has no pattern: set [pattern] image in rig.toml")

@@ -36,6 +36,8 @@ _DEVICE_FIELDS = tuple(f.name for f in fields(Device))
 FOUND_IN_PHOTO = frozenset({"ball_reflectance", "ball_shape"})
 _FILES = {("pattern", "image"), ("sample", "maps")}
 _REQUIRED = [("screen", "size"), ("screen", "height"), ("camera", "offset"), ("ball", "radius")]
+# And of a rig without a screen: what its size and height stand for else.
+_REQUIRED_ALONE = [*_REQUIRED[2:], ("sample", "size"), ("camera", "height")]
 # Metres; the largest displays that are sold are 2.6 m wide.
 LARGEST_SCREEN = 3.0
 _VECTORS = {f.name for f in fields(Rig) if f.type == "Vec3"}
@@ -61,7 +63,8 @@ class RigFile:
 
 
 def read_rig(path: Path, *, fov: float | None = None) -> RigFile:
-    """Read ``rig.toml``. ``fov`` (from EXIF) is taken where the file gives none.
+    """Read ``rig.toml``. ``fov`` (from EXIF) is taken where the file gives none. A file without the
+    sections [screen] and [pattern] is of a rig without a screen.
 
     Raises `InputError` for a missing file, bad TOML, unknown or missing keys, wrong types or sizes.
     """
@@ -99,15 +102,19 @@ def read_rig(path: Path, *, fov: float | None = None) -> RigFile:
                 )  # fmt: skip
                 hint = f"known keys: {', '.join(known)}" if known else "no such section"
                 raise InputError(f"{path}: unknown key {key!r} in section {section!r} ({hint})")
-    for section, key in _REQUIRED:
+    alone = not {"screen", "pattern", "device"} & table.keys()
+    for section, key in _REQUIRED_ALONE if alone else _REQUIRED:
         if _KEYS[section, key] not in values:
-            raise InputError(f"{path}: [{section}] {key} is missing")
+            needed = ", which a rig without a [screen] needs" if alone else ""
+            raise InputError(f"{path}: [{section}] {key} is missing{needed}")
+    if alone:
+        values |= {"screen_size": None, "screen_height": values["camera_height"]}
     fov_from = "rig" if "fov" in values else "unknown" if fov is None else "exif"
     if fov_from == "exif":
         values["fov"] = fov
     rig = Rig(**values)
     warnings: tuple[Notice, ...] = ()
-    width = max(rig.screen_sides)
+    width = max(rig.screen_sides) if rig.has_screen else 0.0
     if width > LARGEST_SCREEN:
         warnings = (
             Notice(
@@ -201,20 +208,23 @@ def rig_text(
     def state(section: str, key: str, value: Any) -> None:
         sections.setdefault(section, []).append(f"{key} = {_text(value)}")
 
+    required = _REQUIRED if rig.has_screen else _REQUIRED_ALONE
     for (section, key), name in _KEYS.items():
         value = getattr(rig, name)
+        if section == "screen" and not rig.has_screen:
+            continue
         # What would else be looked for in the photo is always stated.
         if name not in leave and (
-            (section, key) in _REQUIRED
+            (section, key) in required
             or name in FOUND_IN_PHOTO
             or name == "fov"
             or value != getattr(default, name)
         ):
             state(section, key, value)
-    for key in _DEVICE_FIELDS if device else ():
+    for key in _DEVICE_FIELDS if device and rig.has_screen else ():
         if getattr(device, key) != getattr(IDEAL, key):
             state("device", key, getattr(device, key))
-    if pattern:
+    if pattern and rig.has_screen:
         state("pattern", "image", pattern)
     if sample:
         state("sample", "maps", sample)

@@ -25,6 +25,8 @@ mi.set_log_level(mi.LogLevel.Error)  # it warns of sample counts that it rounds
 
 # Of the screen's size: the table lies so far below the sample, the bezel so far above the lit area.
 SAMPLE_LIFT = 1e-4
+# A glowing sphere: its centre and radius in metres, its radiance (RGB).
+Lamp = tuple[Vec3, float, Vec3]
 
 
 class CookTorrance(mi.BSDF):
@@ -223,10 +225,12 @@ def sample_scene(
     max_depth: int = 2,
     integrator: str = "path",
     device: Device = IDEAL,
+    lamp: Lamp | None = None,
 ) -> mi.Scene:
     """The sample, the screen and the environment alone: what the estimators integrate.
 
-    The same bilinear pattern and environment, the same pixel-wise constant material.
+    The same bilinear pattern and environment, the same pixel-wise constant material. lamp: one that
+    is near, which the estimators do not know.
     """
     emission = {"emitter_samples": 2, "bsdf_samples": 1}
     choice = emission if integrator == "direct" else {"max_depth": max_depth}
@@ -236,6 +240,7 @@ def sample_scene(
             "integrator": {"type": integrator, **choice},
             "sample": _sample(rig, maps),
             **_lights(rig, pattern, environment, gain, device),
+            **_lamp(lamp),
         }
     )
 
@@ -293,7 +298,7 @@ def _lights(
     rig: Rig, pattern: Array | None, environment: Array | None, gain: Any, device: Device
 ) -> dict[str, Any]:
     lights: dict[str, Any] = {}
-    if pattern is not None:
+    if pattern is not None and rig.has_screen:
         corner, (e_x, e_y) = rig.screen_corner, rig.screen_edges
         radiance = {
             "type": "bitmap",
@@ -322,6 +327,14 @@ def _lights(
             ),
         }
     return lights
+
+
+def _lamp(lamp: Lamp | None) -> dict[str, Any]:
+    if lamp is None:
+        return {}
+    centre, radius, radiance = lamp
+    emitter = {"type": "area", "radiance": {"type": "rgb", "value": list(map(float, radiance))}}
+    return {"lamp": {"type": "sphere", "center": list(centre), "radius": radius, "emitter": emitter}}
 
 
 def _mirror(reflectance: Vec3, alpha: float) -> dict[str, Any]:
@@ -397,14 +410,15 @@ def photograph(
     ball: Vec3 | None = None,
     ball_alpha: float = 0.0,
     cover: tuple[Array, tuple[float, float, float, float]] | None = None,
+    lamp: Lamp | None = None,
 ) -> Array:
     """The whole photo (H, W, 3), linear: sample, mirror ball, diffuse table, light between them.
 
     ball: its centre where it is not the rig's; ball_alpha: its roughness. cover: what lies on the
     table under the sample, its reflectance (h, w), row 0 at +y, and its least x, least y, greatest
-    x and greatest y.
+    x and greatest y. lamp: in the room.
     """
-    size = max(rig.screen_sides)
+    size = max(rig.screen_sides) if rig.has_screen else 2 * rig.sample_size
     camera, (right, up, back) = rig.camera, rig.camera_axes
     table = np.broadcast_to(np.asarray(table, dtype=float), 3)
     scene = mi.load_dict(
@@ -445,6 +459,7 @@ def photograph(
             },
             **({} if cover is None else {"cover": _paper(*cover, SAMPLE_LIFT * size / 2)}),
             **_lights(rig, pattern, environment, gain, device),
+            **_lamp(lamp),
         }
     )
     return np.array(mi.render(scene, spp=spp, seed=seed))

@@ -63,7 +63,7 @@ def make_scene(
 ) -> Scene:
     """A `Scene` from (h, w, 3) pattern and (H, 2H, 3) environment arrays, either may be None.
 
-    gain: RGB radiance of the pattern's white; scale multiplies the environment; device: the display
+    A rig without a screen leaves out the pattern. gain: RGB radiance of the pattern's white; scale multiplies the environment; device: the display
     that shows the pattern. Raises `InputError` for wrong shapes and for
     negative or non-finite lights.
     """
@@ -77,14 +77,15 @@ def make_scene(
         if np.any(environment):
             flat_env = scalar(aligned(environment.ravel(), scalar))
             env_height = environment.shape[0]
-    if pattern is not None:
+    if pattern is not None and rig.has_screen:
         pattern = _checked(pattern, "pattern", "(H, W, 3)")
         pattern = device.shown(pattern)
         # A black screen matters where it hides something.
         if np.any(pattern) or flat_env is not None:
             flat_pattern = scalar(aligned(pattern.ravel(), scalar))
             pattern_shape = (pattern.shape[0], pattern.shape[1])
-    corner, (edge_x, edge_y) = rig.screen_body
+    none = np.zeros(3)
+    corner, (edge_x, edge_y) = rig.screen_body if rig.has_screen else (none, (none, none))
     # Opaque, so that new values of the pose, the gain or the scale do not compile new kernels.
     opaque = lambda v: dr.opaque(scalar, float(v))  # noqa: E731
     place = lambda p: vec3(*(opaque(c) for c in p))  # noqa: E731

@@ -118,7 +118,7 @@ def _sizes(found: FoundLights) -> Said:
 
 def _light(found: FoundLights) -> Said:
     share = pattern_share(found.lights)
-    if share < WANTED.pattern_share:
+    if found.lights.rig.has_screen and share < WANTED.pattern_share:
         yield (
             "darken-room",
             f"the pattern gives {share:.0%} of the light on the sample: full brightness on the "
@@ -146,10 +146,11 @@ def _rig(found: FoundLights) -> Said:
     if fit.get("screen_tilt", 0) > WANTED.screen_tilt:
         tilt = fit["screen_tilt"]
         yield "level-display", f"the display hangs {tilt:.0f}° off level: rest it on equal feet"
-    if fit.get("screen_shift", 0) > WANTED.screen_shift * max(rig.screen_sides):
+    shift = fit.get("screen_shift", 0)
+    if shift and shift > WANTED.screen_shift * max(rig.screen_sides):
         yield (
             "measure-display",
-            f"the display hangs {1000 * fit['screen_shift']:.0f} mm from where rig.toml says: "
+            f"the display hangs {1000 * shift:.0f} mm from where rig.toml says: "
             "measure its height above the sample and the gap to the lens again",
         )
 

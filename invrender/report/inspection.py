@@ -115,14 +115,14 @@ def _photo_notices(found: FoundLights, ball: Ball, share: float) -> list[Notice]
     if saturated > 0:
         text = f"{saturated:.1%} of the sample is saturated; the photo tells nothing there: expose "
         notices.append(Notice("sample-saturated", text + "shorter"))
-    blur = lights.fit["blur"]
+    blur = lights.fit.get("blur", 0.0)
     if blur > BLURRED * ball.radius:
         text = (
             f"the photo is blurred by {blur:.1f} pixels in the ball, too much to read the pattern "
             "well: focus, hold still, or go closer"
         )
         notices.append(Notice("photo-blurred", text))
-    if share < WEAK:
+    if lights.rig.has_screen and share < WEAK:
         text = (
             f"the pattern gives only {share:.0%} of the light on the sample: turn the display's "
             "brightness up or the room's light down"
@@ -174,7 +174,7 @@ def annotate(found: FoundLights) -> Image.Image:
     picture.paste(inset, (picture.width - inset.width, picture.height - inset.height))
     _legend(picture, {
         "ball": f"ball ({rig.ball_shape})", "horizon": "horizon in it",
-        "screen": "screen in it, with its corners", "sample": "sample",
+        "screen": "screen in it, with its corners" if rig.has_screen else "", "sample": "sample",
         "marker": f"{len(sheet.ids)} markers of the capture sheet" if sheet else "",
         "saturated": "saturated" if photo.clipped.any() else "",
     })  # fmt: skip
@@ -200,9 +200,10 @@ def outlines(rig: Rig, ball: Ball, height: int, width: int) -> dict[str, Array]:
     points = {
         "ball": outline_points(rig, centre, ball.radius_m),
         "horizon": horizon_points(rig, centre, ball.radius_m),
-        "screen": _screen_image(rig, ball),
         "sample": rig.sample_corners,
     }
+    if rig.has_screen:
+        points["screen"] = _screen_image(rig, ball)
     return {name: rig.project(p, height, width) for name, p in points.items()}
 
 

@@ -30,10 +30,11 @@ def map_notices(
     def note(code: str, text: str) -> None:
         notices.append(Notice(code, text))
 
-    if fit.get("screen_shift", 0) > FAR_OFF * max(lights.rig.screen_sides):
+    shift = fit.get("screen_shift", 0)
+    if shift and shift > FAR_OFF * max(lights.rig.screen_sides):
         note(
             "screen-far-off",
-            f"in the ball, the screen hangs {1000 * fit['screen_shift']:.0f} mm from where "
+            f"in the ball, the screen hangs {1000 * shift:.0f} mm from where "
             "rig.toml says: check its sizes, above all the screen's height",
         )
     if clipped.any():

@@ -48,13 +48,13 @@ def report_html(
     maps: Maps,
     sigma: dict[str, Array],
     environment: Array,
-    pattern: Array,
+    pattern: Array | None,
     photo: Array,
     picture: Array,
 ) -> str:
     """The page. sigma: of each encoded map, see `invrender.maps.Estimate`. environment:
-    (H, 2H, 3) radiance; pattern: (h, w, 3) the screen's radiance as captured; photo, picture:
-    (N, N, 3) radiance of the sample and of its re-rendering."""
+    (H, 2H, 3) radiance; pattern: (h, w, 3) the screen's radiance as captured, None
+    without one; photo, picture: (N, N, 3) radiance of the sample and of its re-rendering."""
     white = max(float(np.percentile(photo, 99.5)), 1e-12)
     encoded = maps.encoded()
     pictures = [
@@ -83,12 +83,10 @@ def report_html(
             "all directions above the table, straight up along the top edge; filled in behind the "
             "screen",
         ),
-        (
-            _jpeg(linear_to_srgb(pattern / _level(pattern))),
-            "Screen",
-            "as seen from above",
-        ),
     ]
+    if pattern is not None:
+        uri = _jpeg(linear_to_srgb(pattern / _level(pattern)))
+        lights.append((uri, "Screen", "as seen from above"))
     script = _data("viewer.js")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(
@@ -173,20 +171,20 @@ def _tiles(report: Report, total: float) -> list[tuple[str, str]]:
 def _facts(report: Report) -> list[tuple[str, str]]:
     fit = report.capture_fit
     facts = [
-        ("screen's white", " / ".join(f"{g:.2f}" for g in fit["gain"])),
         ("start", {"network": "the network's maps", "flat": "a flat sample"}[report.init]),
         ("converged", "yes" if report.converged else "no"),
     ]
+    if any(fit["gain"]):
+        facts.insert(0, ("screen's white", " / ".join(f"{g:.2f}" for g in fit["gain"])))
     if "screen_tilt" in fit:
         where = f"{fit['screen_tilt']:.1f}°, {1000 * fit['screen_shift']:.1f} mm"
         facts.insert(1, ("screen's tilt and shift", where))
     if "ball_centre" in fit:
         x, y = fit["ball_centre"]
         where = f"({x:.1f}, {y:.1f}), radius {fit['ball_radius']:.1f} pixels"
-        facts[:0] = [
-            ("ball in the photo", where),
-            ("pattern misfit in the ball", f"{fit['residual']:.1%}"),
-        ]
+        facts.insert(0, ("ball in the photo", where))
+    if "residual" in fit:
+        facts.insert(1, ("pattern misfit in the ball", f"{fit['residual']:.1%}"))
     return facts
 
 

@@ -16,7 +16,7 @@ from invrender.files.images import read_image
 from invrender.files.maps import read_maps, write_maps
 from invrender.files.rig_toml import read_rig, write_rig
 from invrender.files.write import write_exr, write_png
-from invrender.lights import IDEAL, Device, Lights
+from invrender.lights import IDEAL, NO_PATTERN, Device, Lights
 from invrender.maps import NAMES, Estimate, Maps
 from invrender.report.report import Report
 from invrender.types import Array, InputError
@@ -24,6 +24,8 @@ from invrender.types import Array, InputError
 SAMPLES = 256  # of the specular lobe in the rendering that is kept
 # What is a number in `Report.capture_fit` but of the ball, not of the lights' fit.
 _BALL = ("ball_radius", "ball_confidence")
+PATTERNS = "shown", "captured"
+MAY_LACK = ("coverage.exr", *(f"pattern_{k}.exr" for k in PATTERNS))
 
 
 @dataclass(frozen=True)
@@ -86,9 +88,10 @@ class Result:
                     return
                 # Without its report a folder is no result: neither the old one nor the new.
                 (out / "report.json").unlink(missing_ok=True)
-                # The one file that a result may lack: an older result's would be read as its own.
-                if self.lights.coverage is None:
-                    (out / "coverage.exr").unlink(missing_ok=True)
+                # What a result may lack: an older result's would be read as its own.
+                for lacking in MAY_LACK:
+                    if not (new / lacking).exists():
+                        (out / lacking).unlink(missing_ok=True)
                 order = {"sample.exr": 0, "report.json": 2}  # the first tells it from a capture
                 for file in sorted(new.iterdir(), key=lambda f: order.get(f.name, 1)):
                     os.replace(file, out / file.name)
@@ -100,8 +103,10 @@ class Result:
 
         maps, sigma, lights, photo = self.maps, self.estimate.sigma, self.lights, self.photo
         rendering = self.render() if self.rendering is None else self.rendering
-        screen = lights.pattern_captured
-        if screen is None:
+        screen: Array | None = lights.pattern_captured
+        if not lights.rig.has_screen:
+            screen = None
+        elif screen is None:
             screen = lights.shown * np.asarray(lights.gain, np.float32)
         width = lights.rig.sample_size
         write_maps(folder, maps, width=width)
@@ -113,8 +118,9 @@ class Result:
         falloff = Device(falloff=lights.device.falloff)
         write_rig(folder / "rig.toml", lights.rig, device=falloff)
         write_exr(folder / "environment.exr", lights.environment)
-        write_exr(folder / "pattern_shown.exr", lights.shown)
-        write_exr(folder / "pattern_captured.exr", screen)
+        if screen is not None:
+            write_exr(folder / "pattern_shown.exr", lights.shown)
+            write_exr(folder / "pattern_captured.exr", screen)
         if lights.coverage is not None:
             write_exr(folder / "coverage.exr", lights.coverage)
         write_exr(folder / "sample.exr", photo, width=width)
@@ -145,13 +151,16 @@ class Result:
         fit = dict(report.capture_fit)
         gain = np.asarray(fit.pop("gain"), np.float32)
         told = read_rig(folder / "rig.toml")
+        shown = captured = None
+        if told.rig.has_screen:
+            shown, captured = (read_image(folder / f"pattern_{k}.exr") for k in PATTERNS)
         lights = Lights(
             told.rig,
-            read_image(folder / "pattern_shown.exr"),
+            NO_PATTERN if shown is None else shown,
             read_image(folder / "environment.exr"),
             gain,
             read_image(coverage)[..., 0] if coverage.exists() else None,
-            read_image(folder / "pattern_captured.exr"),
+            captured,
             {k: v for k, v in fit.items() if k not in _BALL and isinstance(v, float)},
             told.device or IDEAL,
         )

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from forward_scenes import rendered, some_environment, some_maps, some_pattern
 
+from invrender.data.simulate_setup import without_screen
 from invrender.maps import constant_maps
 from invrender.render import path_traced as photograph
 from invrender.rig import Rig
@@ -34,6 +35,20 @@ def test_whole_photograph_agrees_on_the_sample():
     seen = sample_region(rig, photo, n)
     difference = np.abs(seen - ours).mean() / ours.mean()
     assert difference < 0.02, difference
+
+
+def test_a_lamp_lights_the_sample_as_a_sphere_does():
+    """E = π L (r / d)² cos θ from a sphere above the horizon; no screen is in its way."""
+    rig = without_screen(Rig())
+    centre, radius, level = (0.2, 0.1, 0.4), 0.05, 30.0
+    white = constant_maps(4, 4, diffuse=1.0, specular=0.0)
+    scene = photograph.sample_scene(rig, white, None, None, lamp=(centre, radius, (level,) * 3))
+    seen = photograph.path_traced(scene, rig, 4, 4, 256)
+    to = np.array(centre) - rig.sample_points(4, 4)
+    d = np.linalg.norm(to, axis=-1)
+    expected = level * radius**2 * to[..., 2] / d**3
+    # Fresnel's share of a dielectric without f0 is small away from grazing angles.
+    np.testing.assert_allclose(seen, expected[..., None] * np.ones(3), rtol=0.02)
 
 
 def test_ball_and_table_are_where_the_rig_says():

@@ -238,3 +238,30 @@ def test_where_the_field_of_view_is_known_from(tmp_path):
     path.write_text(PLAIN.replace("fov = 70\n", ""))
     assert read_rig(path, fov=50.0).fov_from == "exif"
     assert read_rig(path).fov_from == "unknown"
+
+
+def test_a_rig_without_a_screen_goes_through_its_file(tmp_path):
+    rig = Rig(screen_size=None, screen_height=0.2, camera_height=0.2, sample_side=0.06)
+    write_rig(tmp_path / "rig.toml", rig, "pattern.exr", device=Device(falloff=1.0))
+    assert "screen" not in (tmp_path / "rig.toml").read_text()
+    told = read_rig(tmp_path / "rig.toml")
+    assert told.rig == rig and not told.rig.has_screen and told.device is None
+    assert rig.camera[2] == 0.2 and rig.sample_size == 0.06
+    assert not rig.screen_cosines(np.zeros((2, 3)), 4).any()
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("[sample]\nsize = 0.09", "camera. height is missing, which a rig without"),
+        ("height = 0.2", "sample. size is missing, which a rig without"),
+        ('height = 0.2\n[pattern]\nimage = "p.png"', "screen. size is missing$"),
+    ],
+)
+def test_what_a_rig_without_a_screen_needs_is_told(tmp_path, text, match):
+    path = tmp_path / "rig.toml"
+    path.write_text("[ball]\nradius = 0.01\n[camera]\noffset = 0.01\n" + text)
+    with pytest.raises(InputError, match=match):
+        read_rig(path)
+    with pytest.raises(InputError, match="without a screen"):
+        Rig(screen_size=None)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from invrender.files.capture import load_set
+from invrender.files.capture import load_capture, load_set
 from invrender.files.rig_toml import write_rig
 from invrender.files.write import write_exr
 from invrender.lights import Device
@@ -37,4 +37,19 @@ def test_a_sets_patterns_are_shown_by_the_display_that_is_told(folder):
 def test_a_pattern_of_a_set_that_is_none_is_refused(folder, value, match):
     write_exr(folder / "pattern_2.exr", np.full((4, 4, 3), value))
     with pytest.raises(InputError, match=match):
+        load_set(folder)
+
+
+def test_photos_without_a_screen_have_each_their_own_light(folder):
+    rig = Rig(screen_size=None, sample_side=0.09, camera_height=0.15, screen_height=0.15)
+    write_rig(folder / "rig.toml", rig)
+    for i in (1, 2):
+        (folder / f"pattern_{i}.exr").unlink()
+    captures, patterns = load_set(folder)
+    assert len(captures) == 2 and patterns == []
+    assert all(c.rig == rig and not c.pattern.any() for c in captures)
+    with pytest.raises(InputError, match="each under its own light"):
+        load_capture(folder)
+    write_exr(folder / "pattern.exr", np.ones((4, 4, 3)))
+    with pytest.raises(InputError, match="rig.toml no .screen."):
         load_set(folder)
