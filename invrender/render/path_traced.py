@@ -334,7 +334,9 @@ def _lamp(lamp: Lamp | None) -> dict[str, Any]:
         return {}
     centre, radius, radiance = lamp
     emitter = {"type": "area", "radiance": {"type": "rgb", "value": list(map(float, radiance))}}
-    return {"lamp": {"type": "sphere", "center": list(centre), "radius": radius, "emitter": emitter}}
+    return {
+        "lamp": {"type": "sphere", "center": list(centre), "radius": radius, "emitter": emitter}
+    }
 
 
 def _mirror(reflectance: Vec3, alpha: float) -> dict[str, Any]:

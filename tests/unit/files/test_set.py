@@ -51,5 +51,5 @@ def test_photos_without_a_screen_have_each_their_own_light(folder):
     with pytest.raises(InputError, match="each under its own light"):
         load_capture(folder)
     write_exr(folder / "pattern.exr", np.ones((4, 4, 3)))
-    with pytest.raises(InputError, match="rig.toml no .screen."):
+    with pytest.raises(InputError, match=r"rig.toml no \[screen\]"):
         load_set(folder)
