@@ -84,10 +84,10 @@ NO_PATTERN: Array = np.zeros((1, 1, 3), np.float32)  # where the rig has no scre
 class Lights:
     """The screen's light and the room's, in one unit of radiance (a photo's, where one shows them).
 
-    rig: where screen and camera are. The screen's radiance is ``gain`` (a number or RGB) times
-    what ``device`` makes of ``pattern`` (h, w, 3), linear values in [0, 1], row 0 at +y: ``shown``
-    straight ahead, less towards the sides; `NO_PATTERN` of a rig without a screen. environment: linear RGB radiance (H, 2H, 3), row 0 at
-    the zenith; zeros, as by default, for a dark room.
+    rig: where screen and camera are. The screen's radiance is ``gain`` (a number or RGB) times what
+    ``device`` makes of ``pattern`` (h, w, 3), linear values in [0, 1], row 0 at +y: ``shown``
+    straight ahead, less towards the sides; `NO_PATTERN` of a rig without a screen. environment:
+    linear RGB radiance (H, 2H, 3), row 0 at the zenith; zeros, as by default, for a dark room.
 
     What `invrender.find_lights` adds of a photo's mirror ball. coverage: (H, 2H), the share of each
     texel of the environment that the ball really shows, the rest is filled in. pattern_captured:

@@ -63,8 +63,8 @@ def find_lights(
     ball: its circle in the photo, x, y, radius in pixels, where it is given by hand. environment:
     the room's radiance (H, 2H, 3) in the photo's unit, linear RGB, if it is known; zeros for a dark
     room. gain: the screen's radiance for a white pattern, likewise, a number or RGB. With both, or
-    with the room of a rig without a screen, no ball is looked for. Raises `InputError` where no ball is found, or where it does not show the
-    pattern.
+    with the room of a rig without a screen, no ball is looked for. Raises `InputError` where no
+    ball is found, or where it does not show the pattern.
 
         capture = load_capture("my-capture")
         found = find_lights(capture)

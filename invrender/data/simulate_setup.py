@@ -143,7 +143,8 @@ def draw_setup(
     ``exposures``) or "jpeg" (one, exposed for the sample or in the middle between it and the
     display in the ball). sphere: whether the ball is one, drawn if None; camera_height: metres,
     where the camera's lens is to follow from it. lamps: so many photos without a screen instead,
-    each exposed for the sample under a lamp of its own, the camera held anew. Raises `InputError` where no lens does.
+    each exposed for the sample under a lamp of its own, the camera held anew. Raises `InputError`
+    where no lens does.
     """
     draw = _Draw(seed)
     rig = _geometry(draw, sphere, camera_height)

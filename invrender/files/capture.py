@@ -124,8 +124,8 @@ def _capture(
 
 
 def load_set(folder: str | Path) -> tuple[list[Capture], list[Array]]:
-    """Read a folder of photos under a set of patterns, or each under its own light without a screen:
-    the captures, and the patterns of which each shows one.
+    """Read a folder of photos under a set of patterns, or without a screen, each under its own
+    light: the captures, and the patterns of which each shows one.
 
     Its patterns are ``pattern_1.*``, ``pattern_2.*`` and so on, and its photos ``photo_1.*`` and so
     on, in any order. Every capture has the first pattern until `invrender.capture.which_pattern`

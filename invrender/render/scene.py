@@ -63,9 +63,9 @@ def make_scene(
 ) -> Scene:
     """A `Scene` from (h, w, 3) pattern and (H, 2H, 3) environment arrays, either may be None.
 
-    A rig without a screen leaves out the pattern. gain: RGB radiance of the pattern's white; scale multiplies the environment; device: the display
-    that shows the pattern. Raises `InputError` for wrong shapes and for
-    negative or non-finite lights.
+    A rig without a screen leaves out the pattern. gain: RGB radiance of the pattern's white; scale
+    multiplies the environment; device: the display that shows the pattern. Raises `InputError` for
+    wrong shapes and for negative or non-finite lights.
     """
     vec3 = vector(scalar, 3)
     flat_env, flat_pattern = None, None
