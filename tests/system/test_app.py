@@ -9,8 +9,9 @@ import time
 from pathlib import Path
 
 import pytest
-from app_server import Server
-from chromium import CHROMIUM, Page
+
+from benchmarks.common.app_server import Server
+from benchmarks.common.chromium import CHROMIUM, Page
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium (apt-get install chromium)")
 

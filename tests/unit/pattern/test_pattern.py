@@ -10,12 +10,12 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from chromium import CHROMIUM, Page
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 from rich.console import Console
 
+from benchmarks.common.chromium import CHROMIUM, Page
 from invrender.capture.sheet_layout import capture_sheet, marker_dictionary
 from invrender.cli.pattern import add_parser
 from invrender.data.environments import procedural_environment

@@ -10,9 +10,9 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from chromium import CHROMIUM, Page
 from PIL import Image
 
+from benchmarks.common.chromium import CHROMIUM, Page
 from invrender.colour import linear_to_srgb, srgb_to_linear
 from invrender.data.materials import procedural_material
 from invrender.maps import NAMES, Maps
