@@ -20,7 +20,7 @@ from scipy import ndimage
 from benchmarks.common.photos import Shot, arguments, make_shot
 from benchmarks.common.results import table, write_results
 from invrender.capture.ball_image import trace_image
-from invrender.capture.clipped_lamps import clipped_share, raise_clipped
+from invrender.capture.clipped_lamps import clipped_light, raise_clipped
 from invrender.capture.environment import fill_environment, unfold_environment
 from invrender.capture.mirror import make_ball
 from invrender.data.environments import find_environments, procedural_environment, read_environment
@@ -66,16 +66,16 @@ def measure(shot: Shot) -> dict[str, Any] | None:
     size = (photo.height, photo.width)
     image = trace_image(rig, make_ball(rig, shot.ball, rig.ball_radius, size))
     environment, coverage = unfold_environment(photo, rig, image)
-    share = clipped_share(photo, rig, image, len(environment))
-    if (share.max(-1) > 0).mean() < LIT / 2:
+    clipped = clipped_light(photo, rig, image, len(environment))
+    if (clipped.max(-1) > 0).mean() < LIT / 2:
         return None
     level = photo.clip_level / np.asarray(rig.ball_reflectance)
     x = environment / level
-    raised, factor, _ = raise_clipped(
+    raised, factor, _, _ = raise_clipped(
         photo, rig, image, (shot.pattern, shot.gain, shot.device), environment, coverage
     )  # fmt: skip
     results: list[Array] = [
-        environment, environment + share * level,
+        environment, environment + clipped,
         x * x.mean(-1, keepdims=True) ** 2, raised,
     ]  # fmt: skip
     truth = shot.environment.copy()

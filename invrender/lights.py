@@ -90,7 +90,9 @@ class Lights:
     linear RGB radiance (H, 2H, 3), row 0 at the zenith; zeros, as by default, for a dark room.
 
     What `invrender.find_lights` adds of a photo's mirror ball. coverage: (H, 2H), the share of each
-    texel of the environment that the ball really shows, the rest is filled in. pattern_captured:
+    texel of the environment that the ball really shows, the rest is filled in. lamps: (H, 2H, 3),
+    what of the environment is light of saturated lamps, whose radiance the ball does not tell; None
+    where there are none. pattern_captured:
     (P, P, 3), the screen's radiance as the ball shows it. fit: how well all of it fits, by name:
     ``residual`` of the pattern relative to the gain, ``gain_deviation`` the standard deviation of
     the logarithm of the screen's light, ``gamma`` and ``falloff`` the device's, ``blur`` the
@@ -117,16 +119,21 @@ class Lights:
     pattern_captured: Array | None = None
     fit: dict[str, float] = field(default_factory=dict)
     device: Device = IDEAL
+    lamps: Array | None = None
 
     @property
     def shown(self) -> Array:
         """Relative radiance (h, w, 3) straight ahead of the screen: the pattern as displayed."""
         return self.device.shown(self.pattern)
 
-    def scaled(self, screen: Array, room: Array) -> Lights:
-        """With the screen's and the room's radiance times RGB factors."""
+    def scaled(self, screen: Array, room: Array, lamps: Array) -> Lights:
+        """With the radiance of the screen, the room and the lamps that saturate, times RGB factors."""
         gain = np.broadcast_to(np.asarray(self.gain, np.float32), 3) * screen
-        return replace(self, gain=gain, environment=self.environment * room)
+        environment = self.environment * room
+        if self.lamps is None:
+            return replace(self, gain=gain, environment=environment)
+        environment = np.maximum(environment + self.lamps * (lamps - room), 0)
+        return replace(self, gain=gain, environment=environment, lamps=self.lamps * lamps)
 
     def placed(self, place: Array) -> Lights:
         """Seen from a sample that lies elsewhere: where the homography ``place`` (3, 3) takes the
@@ -140,5 +147,10 @@ class Lights:
         rig = replace(rig, camera_shift=tuple(np.add(rig.camera_shift, by).tolist()))
         if rig.has_screen:
             rig = replace(rig, screen_shift=tuple(np.add(rig.screen_shift, by).tolist()))
-        room = rotate_environment(self.environment, -angle % (2 * np.pi)) if angle else None
-        return replace(self, rig=rig, environment=self.environment if room is None else room)
+        if not angle:
+            return replace(self, rig=rig)
+        room, lamps = (
+            None if x is None else rotate_environment(x, -angle % (2 * np.pi))
+            for x in (self.environment, self.lamps)
+        )
+        return replace(self, rig=rig, environment=room, lamps=lamps)

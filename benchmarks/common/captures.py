@@ -45,13 +45,15 @@ class CaptureSet:
 
     split: of `nets.training.draw`, whose real materials and rooms are used, every ``every``-th
     material. first_seed: of all that is drawn, capture k's is k higher; no two benchmarks share
-    one. noise: of the sensor, relative, logarithmically uniform between the two.
+    one. noise: of the sensor, relative, logarithmically uniform between the two. later: by how many
+    places further on materials and rooms are drawn: other parts of them, in other pairs.
     """
 
     split: str
     first_seed: int
     noise: tuple[float, float] = (0.005, 0.005)
     every: int = 1
+    later: int = 0
 
     def noise_of(self, k: int) -> float:
         """The k-th capture's noise, of a pixel at the photo's 99th percentile."""
@@ -68,7 +70,7 @@ class CaptureSet:
 
 
 PHOTOGRAPHS = CaptureSet("holdout", 90_000)
-OTHERS = CaptureSet("families", 190_000, noise=(0.002, 0.02))
+OTHERS = CaptureSet("families", 590_000, noise=(0.002, 0.02), later=56)
 
 
 def make_captures(
@@ -111,6 +113,7 @@ def sample_and_room(
     found, found_rooms = drawn.choose(materials, rooms)
     seed = drawn.first_seed + k
     rng = np.random.default_rng(seed)
+    k += drawn.later
     maps = _material(found, k, size) if found else procedural_material(seed, size, size)
     if found_rooms:
         n = len(found_rooms)

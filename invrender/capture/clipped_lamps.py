@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy import optimize
+from scipy import ndimage, optimize
 
 from invrender.capture.ball_image import BallImage
 from invrender.capture.environment import fill_environment, unfold_environment
@@ -24,23 +24,33 @@ from invrender.rig import Rig
 from invrender.types import TINY, Array, Mask
 
 
-def clipped_share(photo: Photo, rig: Rig, image: BallImage, height: int) -> Array:
-    """(H, 2H, 3): the share of each texel of the environment whose channel is clipped."""
+def clipped_light(photo: Photo, rig: Rig, image: BallImage, height: int) -> Array:
+    """(H, 2H, 3): what of the environment's radiance is clipped.
+
+    A JPEG's colours are coarser than its brightness: of a small lamp of which some channel is
+    clipped another may stay a little below white everywhere, and is as wrong.
+    """
     area = image.area
+    light = np.zeros(photo.image.shape, np.float32)
     if photo.clip_level is None or photo.image[area].max() < photo.clip_level:
         return np.zeros((height, 2 * height, 3), np.float32)
-    full = np.zeros(photo.image.shape, np.float32)
-    full[area] = photo.image[area] >= photo.clip_level
-    share, _ = unfold_environment(Photo(full), rig, image, height)
-    return np.asarray(share * np.asarray(rig.ball_reflectance), np.float32)
+    pixels = photo.image[area]
+    clipped = pixels >= photo.clip_level
+    lamp, count = ndimage.label(clipped.any(-1))
+    channels = np.zeros((count + 1, 3), bool)
+    np.logical_or.at(channels, lamp, clipped)
+    hidden = ~channels[lamp] & (lamp > 0)[..., None]
+    clipped |= hidden & (pixels >= CLIPPED_LAMPS.beside * photo.clip_level)
+    light[area] = pixels * clipped
+    return unfold_environment(Photo(light), rig, image, height)[0]
 
 
 def raise_clipped(
     photo: Photo, rig: Rig, image: BallImage, screen: tuple[Array, Array, Device],
     environment: Array, coverage: Array, gain_deviation: float = 0.0,
-) -> tuple[Array, float, Array]:  # fmt: skip
-    """The environment (H, 2H, 3) with its clipped texels raised; how many times, the mean; and the
-    factor (3,) on the screen's gain.
+) -> tuple[Array, float, Array, Array | None]:  # fmt: skip
+    """The environment (H, 2H, 3) with its clipped texels raised; how many times, the mean; the
+    factor (3,) on the screen's gain; and what of the environment is raised light, if any.
 
     The screen: pattern (h, w, 3), gain (3,) and display; ``gain_deviation`` is that of the
     logarithm of its gain, by the ball. One factor per channel is found for all clipped texels, and
@@ -50,15 +60,13 @@ def raise_clipped(
     varies more. That the screen shades the table from the clipped lamps counts too. 1 where nothing
     is clipped, and where the gain is known.
     """
-    share = clipped_share(photo, rig, image, len(environment))
+    clipped = clipped_light(photo, rig, image, len(environment))
     doubted = gain_deviation > CLIPPED_LAMPS.known_gain
-    if not (share.any() or doubted):
-        return environment, 1.0, np.ones(3)
-    level = photo.clip_level or 0.0
-    extra = np.asarray(share * level / np.asarray(rig.ball_reflectance), np.float32)
+    if not (clipped.any() or doubted):
+        return environment, 1.0, np.ones(3), None
     filled = fill_environment(environment, coverage)
     seen, at, use, lit, room = lit_table(photo, rig, image.ball, screen, filled)
-    lamps = room_irradiance(rig, at, extra)
+    lamps = room_irradiance(rig, at, clipped)
     factors = _Factors(seen, use, lit, room, lamps)
     doubt = CLIPPED_LAMPS.gain_doubt * gain_deviation if doubted else 0.0
     x, y = factors.fit(doubt)
@@ -67,8 +75,9 @@ def raise_clipped(
         if not told or abs(y.mean()) >= CLIPPED_LAMPS.likely_gain * doubt:
             x, y = factors.fit(0.0)
     factor, gain = np.exp(x), np.exp(y)
-    raised = environment + extra * (factor - 1).astype(np.float32)
-    return np.asarray(raised, np.float32), float(factor.mean()), gain
+    raised = environment + clipped * (factor - 1).astype(np.float32)
+    lamps = np.minimum(clipped * factor, raised).astype(np.float32) if clipped.any() else None
+    return np.asarray(raised, np.float32), float(factor.mean()), gain, lamps
 
 
 class _Factors:

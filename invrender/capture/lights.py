@@ -191,7 +191,7 @@ def _measure(
     fit |= _mirror_numbers(capture, rig, ball)
     fit["room_saturated"] = _room_saturated(photo, rig, image)
     environment, coverage = unfold_environment(photo, rig, image, height, screen.blur)
-    environment, fit["room_raised"], factor = raise_clipped(
+    environment, fit["room_raised"], factor, lamps = raise_clipped(
         photo, rig, image, lit, environment, coverage,
         screen.gain_deviation if screen.saturated > SCREEN_FIT.saturated else 0.0,
     )  # fmt: skip
@@ -206,7 +206,9 @@ def _measure(
     environment, fit["hidden_lamp"] = add_hidden_lamp(photo, rig, ball, lit, environment, coverage)
     size = min(PATTERN_CHECK.captured_size, max(capture.pattern.shape[:2]))
     captured = unfold_pattern(photo, rig, ball, size)
-    lights = Lights(rig, capture.pattern, environment, gain, coverage, captured, fit, screen.device)
+    lights = Lights(
+        rig, capture.pattern, environment, gain, coverage, captured, fit, screen.device, lamps
+    )
     return lights, screen.response
 
 

@@ -515,6 +515,8 @@ class ClippedLamps:
     plain: float = 0.06
     likely_gain: float = 2.0  # deviations, in that, by which it may differ; by hand
     greatest: float = 6.0  # by hand
+    # Of white, from which a channel is clipped in a lamp that is clipped in others alone; by hand.
+    beside: float = 0.8
     starts: tuple[float, float, int] = (0.05, 4, 10)  # from, to, number; by hand
     inside: float = 1e-6  # distance of a start from the bounds; by hand
 

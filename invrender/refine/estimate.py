@@ -49,7 +49,7 @@ class Initial:
 def observe(photo: Array, lights: Lights, clipped: Mask) -> Observation:
     """A photo of the sample with its forward model."""
     mask = clipped if clipped.any() else None
-    return Observation(photo, Fast.under(lights), mask, light_doubt(lights.fit))
+    return Observation(photo, Fast.under(lights), mask, light_doubt(lights.fit), lights.lamps)
 
 
 def flat_start(photos: Sequence[Observation], samples: int) -> Initial:

@@ -46,21 +46,22 @@ class Observation:
 
     clipped (H, W): pixels that the photo does not measure; None where it measures all. doubt:
     deviations of the logarithms of the screen's and of the room's radiance; (0, 0) where the lights
-    are known.
+    are known. lamps: as in `invrender.lights.Lights`, the light that the room's doubt is not about.
     """
 
     photo: Array
     renderer: Renderer
     clipped: NDArray[np.bool_] | None = None
     doubt: tuple[float, float] = (0.0, 0.0)
+    lamps: Array | None = None
 
 
 @dataclass
 class Refined:
     """Maps, their posterior standard deviations (H, W, 9) in the order of θ, how the fit went.
 
-    interrupted: by Ctrl-C; the maps are the best so far. factors: of each photo's screen and room,
-    RGB, by which the lights were found to be off; empty where they were not fitted. Of several
+    interrupted: by Ctrl-C; the maps are the best so far. factors: of each photo's screen, room and
+    lamps, RGB, by which the lights were found to be off; empty where they were not fitted. Of several
     photos that were explained together: left_out, which do not belong to the others; photo_errors,
     of each that does, the RMS of what the maps leave over its mean.
     """
@@ -70,7 +71,7 @@ class Refined:
     history: list[dict[str, float]] = field(default_factory=list)
     converged: bool = False
     interrupted: bool = False
-    factors: list[tuple[Array, Array]] = field(default_factory=list)
+    factors: list[tuple[Array, Array, Array]] = field(default_factory=list)
     left_out: list[int] = field(default_factory=list)
     photo_errors: list[float] = field(default_factory=list)
 

@@ -4,16 +4,18 @@ A network errs on a material as a whole: its roughness is off by much the same e
 albedo is tinted. One pixel cannot tell, a thousand under different parts of the pattern can. With
 a network's maps θ₀, weights w of the materials and the deviations S of what a material is off by,
 
-    θ = θ₀ + Σ_k w_k·S·z_k + e,     photo ~ gain·I_screen(θ) + room·I_room(θ) + noise;
+    θ = θ₀ + Σ_k w_k·S·z_k + e,
+    photo ~ gain·I_screen(θ) + room·I_room(θ) + lamps·I_lamps(θ) + noise;
 
-unknowns are z, (materials, 7), and the logarithms of gain and room of each photo, RGB. They are
-found by Gauss–Newton steps with each pixel's own e marginalised: the photo is compared by the
+unknowns are z, (materials, 7), and the logarithms of gain, room and lamps of each photo, RGB. They
+are found by Gauss–Newton steps with each pixel's own e marginalised: the photo is compared by the
 means of parts of each material, whose expected spread J·Σ_e·Jᵀ + R includes e. What is far beyond
 it counts little (Student's t).
 
 - **Lights.** The prior of gain and room is what the capture says of them (`Observation.doubt`):
-  the screen's image in the ball fits to a part in a thousand, or a lamp was saturated. Lights that
-  are known are no unknowns, and cost nothing.
+  the screen's image in the ball fits to a part in a thousand. Of lamps that are saturated there the
+  radiance is a guess, but not the place: they have a factor of their own, and the room none of
+  their doubt. Lights that are known are no unknowns, and cost nothing.
 - **Dielectrics** mirror alike in all colours and places. A network's f0 follows the light's
   pattern, and the roughness with it: before anything is fitted f0 becomes the sample's median.
 - **Relief** that the maps do not resolve widens the lobe, like a greater roughness. What the photo
@@ -25,6 +27,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -33,8 +36,9 @@ from invrender.refine.gauss_newton import BAND, Observation, linearise
 from invrender.refine.groups import group
 from invrender.refine.priors import Prior, channel_correlation
 from invrender.refine.theta import D, N, R, S, project
+from invrender.render.renderer import Renderer
 from invrender.sampling import centres
-from invrender.types import TINY, Array
+from invrender.types import Array
 
 UNKNOWNS = 7  # of a material: what θ has but slopes
 KNOWN = (0.0, 0.0)  # doubt of lights that are known
@@ -74,7 +78,7 @@ class Settings:
     dielectric_f0: tuple[float, float] = (0.08, 0.15)  # surely dielectric; no longer one
     least_doubt: float = 0.001  # of the logarithm of the screen's radiance, at least
     room_doubt: float = 0.05  # of the room's
-    raised_doubt: float = 0.6  # of the logarithm by which saturated lamps were raised
+    lamp_doubt: float = 0.3  # of saturated lamps, whose brightness the table tells
     hidden_doubt: float = 0.1  # where a lamp behind the screen was added
     channels: float = 0.5  # of the lights' doubt, by which each colour may differ
     # the materials: groups of like sqrt(k_d), sqrt(f0) and ρ
@@ -89,15 +93,18 @@ class Settings:
 SHARED_SETTINGS = Settings()
 
 
+Factors = tuple[Array, Array, Array]  # of screen, room and lamps, RGB
+
+
 @dataclass(frozen=True)
 class Shared:
     """prior: with the maps as their materials are found to be. observations: with the lights as
-    they are found. factors: of each photo's screen and room, RGB. converged: the steps ended by
+    they are found. factors: of each photo's screen, room and lamps, RGB. converged: the steps ended by
     themselves. misfit: mean square of the parts' residuals over what is expected."""
 
     prior: Prior
     observations: list[Observation]
-    factors: list[tuple[Array, Array]] = field(default_factory=list)
+    factors: list[Factors] = field(default_factory=list)
     converged: bool = True
     misfit: float = 0.0
     interrupted: bool = False
@@ -130,7 +137,7 @@ def share(
         project(theta[part])
     factors = problem.factors(solved.u)
     shots = [
-        o if o.doubt == KNOWN else replace(o, renderer=o.renderer.scaled(*f))
+        o if o.doubt == KNOWN else replace(o, renderer=_scaled(o, *f))
         for o, f in zip(observations, factors, strict=True)
     ]
     return Shared(
@@ -139,12 +146,17 @@ def share(
     )  # fmt: skip
 
 
+def _scaled(o: Observation, screen: Any, room: Any, lamps: Any) -> Renderer:
+    """Under an observation's lights times factors."""
+    added = None if o.lamps is None else o.lamps * (np.float32(lamps) - np.float32(room))
+    return o.renderer.scaled(screen, room, added)
+
+
 def light_doubt(fit: dict[str, float], s: Settings = SHARED_SETTINGS) -> tuple[float, float]:
     """Deviations of the logarithms of screen and room, by `Lights.fit`; nought of known lights."""
     if not fit:
         return KNOWN
-    room = s.room_doubt + s.raised_doubt * float(np.log(max(fit.get("room_raised", 1.0), 1.0)))
-    room += s.hidden_doubt * (fit.get("hidden_lamp", 1.0) > 1)
+    room = s.room_doubt + s.hidden_doubt * (fit.get("hidden_lamp", 1.0) > 1)
     return max(float(fit.get("residual", 0.0)), s.least_doubt), room
 
 
@@ -228,7 +240,8 @@ def parts_of(height: int, width: int, s: Settings = SHARED_SETTINGS) -> Any:
 
 
 class _Problem:
-    """The unknowns u: z of each material, then log gain and log room (6) of each doubtful photo."""
+    """The unknowns u: z of each material, then the logarithms of the lights' factors of each
+    doubtful photo: screen and room (6), and the lamps where there are any (9)."""
 
     def __init__(
         self, observations: Sequence[Observation], prior: Prior, theta: Array, centres: Array,
@@ -244,8 +257,7 @@ class _Problem:
             np.ones(self.theta.shape[:2]) if o.clipped is None else ~o.clipped[at] * 1.0
             for o in observations
         ]
-        self.dark = [None if o.doubt == KNOWN else o.renderer.scaled(0.0, 1.0)
-                     for o in observations]  # fmt: skip
+        self.fewer = [_fewer(o) for o in observations]
         self.shared = shared_sigma(self.theta, s)
         total = prior.expected[at]
         own = _sigma(self.theta, s.part_diffuse, s.part_specular, s.part_roughness, s)
@@ -269,9 +281,12 @@ class _Problem:
         self.part = parts_of(height, width, s)
         self.parts = int(self.part[-1]) + 1
         self.materials = len(centres)
-        doubtful = [i for i, d in enumerate(self.dark) if d is not None]
-        self.light = {i: self.materials * UNKNOWNS + 6 * k for k, i in enumerate(doubtful)}
-        self.size = self.materials * UNKNOWNS + 6 * len(doubtful)
+        self.light: dict[int, slice] = {}
+        self.size = self.materials * UNKNOWNS
+        for i, fewer in enumerate(self.fewer):
+            if fewer:
+                self.light[i] = slice(self.size, self.size + 3 * (1 + len(fewer)))
+                self.size = self.light[i].stop
         self.precision = np.linalg.inv(self._covariance())
 
     def _covariance(self) -> Array:
@@ -282,20 +297,24 @@ class _Problem:
         alike += np.diag(1 - np.diag(alike))
         covariance = np.zeros((self.size, self.size))
         covariance[:n, :n] = np.kron(alike, self.correlation[:UNKNOWNS, :UNKNOWNS])
-        for i, k in self.light.items():
-            for j, sigma in enumerate(self.observations[i].doubt):
-                at = slice(k + 3 * j, k + 3 * j + 3)
+        for i, light in self.light.items():
+            doubts = [*self.observations[i].doubt, s.lamp_doubt]
+            for k, sigma in zip(range(light.start, light.stop, 3), doubts, strict=False):
+                at = slice(k, k + 3)
                 each = np.eye(3) * s.channels**2
                 covariance[at, at] = max(sigma, 1e-4) ** 2 * (1 + each)
         return covariance
 
-    def factors(self, u: Array) -> list[tuple[Array, Array]]:
-        """Of each photo's screen and room, RGB."""
+    def factors(self, u: Array) -> list[Factors]:
+        """Of each photo's screen, room and lamps, RGB."""
         found = []
         for i in range(len(self.observations)):
-            logs = u[self.light[i] :][:6] if i in self.light else np.zeros(6)
-            screen, room = np.exp(logs).astype(np.float32).reshape(2, 3)
-            found.append((screen, room))
+            logs = np.zeros((3, 3))
+            if i in self.light:
+                own = u[self.light[i]].reshape(-1, 3)
+                logs[: len(own)] = own
+            screen, room, lamps = np.exp(logs).astype(np.float32)
+            found.append((screen, room, lamps))
         return found
 
     def offsets(self, u: Array, covariance: Array) -> tuple[Array, Array]:
@@ -319,20 +338,21 @@ class _Problem:
         residual, derivative, precision = (np.concatenate(x) for x in zip(*found, strict=True))
         return residual, derivative, precision
 
-    def _photo(self, i: int, theta: Array, factors: tuple[Array, Array]) -> tuple[Array, ...]:
+    def _photo(self, i: int, theta: Array, factors: Factors) -> tuple[Array, ...]:
         s, photo = self.s, self.photos[i]
         image, jacobian = linearise(self.observations[i].renderer, theta, self.samples)
-        lights = np.zeros((*image.shape, 6), np.float32)
-        dark = self.dark[i]
-        if dark is not None:
-            room = linearise(dark, theta, self.samples)[0]
-            screen = factors[0] * (image - room)
-            room = factors[1] * room
-            brighter = (screen + room) / np.maximum(image, TINY * image.mean() + 1e-30)
-            jacobian *= brighter[..., None]
-            image = screen + room
-            for c in range(3):
-                lights[..., c, c], lights[..., c, 3 + c] = screen[..., c], room[..., c]
+        fewer = self.fewer[i]
+        lights = np.zeros((*image.shape, 3 * (1 + len(fewer))), np.float32)
+        if fewer:
+            left = [(image, jacobian), *(linearise(r, theta, self.samples) for r in fewer)]
+            left.append((np.zeros_like(image), np.zeros_like(jacobian)))
+            apart = [[a - b for a, b in zip(*two, strict=True)] for two in pairwise(left)]
+            image, jacobian = np.zeros_like(image), np.zeros_like(jacobian)
+            for k, (light, derivative) in enumerate(apart):
+                light *= factors[k]
+                image += light
+                jacobian += derivative * factors[k][:, None]
+                lights[..., range(3), range(3 * k, 3 * k + 3)] = light
         own = jacobian * self.own[..., None, :]
         noise = (s.noise[0] * photo) ** 2 + (s.noise[1] * photo.mean()) ** 2 + self.mixing[i]
         shared = jacobian[..., :UNKNOWNS] * self.shared[..., None, :]
@@ -346,8 +366,8 @@ class _Problem:
             derivative = np.zeros((int(kept.sum()), 3, self.size))
             at = slice(k * UNKNOWNS, (k + 1) * UNKNOWNS)
             derivative[..., at] = means(shared) * self.apparent[k]
-            if dark is not None:
-                derivative[..., self.light[i] : self.light[i] + 6] = means(lights)
+            if fewer:
+                derivative[..., self.light[i]] = means(lights)
             a = means(own)
             spread = a @ self.correlation @ np.swapaxes(a, 1, 2)
             spread[:, range(3), range(3)] += means(noise)
@@ -355,6 +375,14 @@ class _Problem:
             precision = np.linalg.inv(spread) * independent[:, None, None]
             parts.append((means(photo - image), derivative, precision))
         return tuple(np.concatenate(x) for x in zip(*parts, strict=True))
+
+
+def _fewer(o: Observation) -> list[Renderer]:
+    """Under an observation's room alone, then its lamps alone; none where its lights are known."""
+    if o.doubt == KNOWN:
+        return []
+    rooms = [(1.0, 1.0)] if o.lamps is None else [(1.0, 1.0), (0.0, 1.0)]
+    return [_scaled(o, 0.0, *factors) for factors in rooms]
 
 
 def _means(image: Array, part: Any, weight: Array, fill: Any, kept: Any) -> Array:

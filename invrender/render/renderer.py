@@ -61,8 +61,12 @@ class Renderer(ABC):
         """Prepared for these lights."""
         return cls(scene_under(lights))
 
-    def scaled(self, screen: Any, room: Any) -> Self:
-        """Under the same lights with the screen's and the room's radiance times a number or RGB."""
+    def scaled(self, screen: Any, room: Any, added: Any = None) -> Self:
+        """Under the same lights with the screen's and the room's radiance times a number or RGB.
+
+        added: radiance (H, 2H, 3) that the room has more then, or less, of as many texels as it
+        has.
+        """
         scene = self.scene
         scalar = scene.scalar
         vec3 = vector(scalar, 3)
@@ -71,6 +75,8 @@ class Renderer(ABC):
         if environment is not None and np.any(np.asarray(room) != 1):
             rgb = aligned(np.tile(np.broadcast_to(room, 3), dr.width(environment) // 3), scalar)
             environment = environment * scalar(rgb)
+        if environment is not None and added is not None:
+            environment = dr.maximum(environment + scalar(aligned(added.ravel(), scalar)), 0)
         return type(self)(replace(scene, gain=scene.gain * vec3(*by), environment=environment))
 
     @abstractmethod
