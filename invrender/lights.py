@@ -127,7 +127,7 @@ class Lights:
         return self.device.shown(self.pattern)
 
     def scaled(self, screen: Array, room: Array, lamps: Array) -> Lights:
-        """With the radiance of the screen, the room and the lamps that saturate, times RGB factors."""
+        """With the radiance of the screen, the room and saturated lamps times RGB factors."""
         gain = np.broadcast_to(np.asarray(self.gain, np.float32), 3) * screen
         environment = self.environment * room
         if self.lamps is None:

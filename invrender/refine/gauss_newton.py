@@ -61,8 +61,8 @@ class Refined:
     """Maps, their posterior standard deviations (H, W, 9) in the order of θ, how the fit went.
 
     interrupted: by Ctrl-C; the maps are the best so far. factors: of each photo's screen, room and
-    lamps, RGB, by which the lights were found to be off; empty where they were not fitted. Of several
-    photos that were explained together: left_out, which do not belong to the others; photo_errors,
+    lamps, RGB, by which the lights were found to be off; empty where they were not fitted. Of
+    several photos that were explained together: left_out, which do not belong to the others; photo_errors,
     of each that does, the RMS of what the maps leave over its mean.
     """
 

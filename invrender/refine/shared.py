@@ -99,8 +99,8 @@ Factors = tuple[Array, Array, Array]  # of screen, room and lamps, RGB
 @dataclass(frozen=True)
 class Shared:
     """prior: with the maps as their materials are found to be. observations: with the lights as
-    they are found. factors: of each photo's screen, room and lamps, RGB. converged: the steps ended by
-    themselves. misfit: mean square of the parts' residuals over what is expected."""
+    they are found. factors: of each photo's screen, room and lamps, RGB. converged: the steps ended
+    by themselves. misfit: mean square of the parts' residuals over what is expected."""
 
     prior: Prior
     observations: list[Observation]
