@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -149,8 +150,6 @@ class Lights:
             rig = replace(rig, screen_shift=tuple(np.add(rig.screen_shift, by).tolist()))
         if not angle:
             return replace(self, rig=rig)
-        room, lamps = (
-            None if x is None else rotate_environment(x, -angle % (2 * np.pi))
-            for x in (self.environment, self.lamps)
-        )
-        return replace(self, rig=rig, environment=room, lamps=lamps)
+        turned = partial(rotate_environment, angle=-angle % (2 * np.pi))
+        lamps = None if self.lamps is None else turned(self.lamps)
+        return replace(self, rig=rig, environment=turned(self.environment), lamps=lamps)

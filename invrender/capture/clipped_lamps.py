@@ -66,8 +66,7 @@ def raise_clipped(
         return environment, 1.0, np.ones(3), None
     filled = fill_environment(environment, coverage)
     seen, at, use, lit, room = lit_table(photo, rig, image.ball, screen, filled)
-    lamps = room_irradiance(rig, at, clipped)
-    factors = _Factors(seen, use, lit, room, lamps)
+    factors = _Factors(seen, use, lit, room, room_irradiance(rig, at, clipped))
     doubt = CLIPPED_LAMPS.gain_doubt * gain_deviation if doubted else 0.0
     x, y = factors.fit(doubt)
     if doubted:  # textures, and a lamp that the screen hides, spoil the table's word

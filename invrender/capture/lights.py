@@ -220,11 +220,12 @@ def _measure_room(
     fit |= _mirror_numbers(capture, rig, image.ball)
     fit["room_saturated"] = _room_saturated(photo, rig, image)
     environment, coverage = unfold_environment(photo, rig, image, height)
-    environment, fit["room_raised"], _ = raise_clipped(
+    environment, fit["room_raised"], _, lamps = raise_clipped(
         photo, rig, image, (NO_PATTERN, np.zeros(3), IDEAL), environment, coverage
     )
     environment = fill_environment(environment, coverage)
-    return Lights(rig, NO_PATTERN, environment, np.zeros(3, np.float32), coverage, None, fit)
+    gain = np.zeros(3, np.float32)
+    return Lights(rig, NO_PATTERN, environment, gain, coverage, None, fit, lamps=lamps)
 
 
 def _mirror_numbers(capture: Capture, rig: Rig, ball: Ball) -> dict[str, float]:
