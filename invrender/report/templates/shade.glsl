@@ -40,38 +40,33 @@ bool trace(vec3 o, vec3 d, out Hit hit) {
   return s >= 0.0;
 }
 #elif SHAPE == 3
-// A cloth in folds: a height field over the square, found by steps and then by halving.
-float folds(vec2 p, out vec2 slope) {
-  vec2 a = vec2(3.1, 1.3), b = vec2(-1.9, 4.3), c = vec2(6.7, -5.2);
-  vec3 at = vec3(dot(a, p), dot(b, p) + 1.0, dot(c, p) + 2.0), s = sin(at), k = cos(at);
-  slope = 0.1 * k.x * a + 0.06 * k.y * b + 0.018 * k.z * c;
-  return 0.1 * s.x + 0.06 * s.y + 0.018 * s.z - 0.1;
+// A cloth in folds: a height field over the square, found by steps that its slope bounds.
+const vec2 FOLD_A = vec2(3.1, 1.3), FOLD_B = vec2(-1.9, 4.3), FOLD_C = vec2(6.7, -5.2);
+const vec3 DEPTHS = vec3(0.1, 0.06, 0.018);
+const float TOP = 0.08, BOTTOM = -0.28;  // the sum of the depths above and below the middle
+const float STEEPEST = 0.78;             // slope: the depths times the folds' lengths
+vec3 phases(vec2 p) {
+  return vec3(dot(FOLD_A, p), dot(FOLD_B, p) + 1.0, dot(FOLD_C, p) + 2.0);
 }
 bool trace(vec3 o, vec3 d, out Hit hit) {
-  const float TOP = 0.08, BOTTOM = -0.28;
-  const int STEPS = 14, HALVINGS = 6;
-  vec2 slope;
+  const int STEPS = 24;
+  const float CLOSE = 3e-4;
+  float speed = STEEPEST * length(d.xy) - d.z;
   float near = (TOP - o.z) / d.z, far = (BOTTOM - o.z) / d.z;
-  float step_t = (far - near) / float(STEPS);
-  float low = near, high = far;
-  bool below = false;
-  for (int i = 1; i <= STEPS; i++) {
-    float t = near + step_t * float(i);
-    vec3 p = o + t * d;
-    if (p.z < folds(p.xy, slope)) { high = t; low = t - step_t; below = true; break; }
+  hit.t = near;
+  for (int i = 0; i < STEPS; i++) {
+    hit.p = o + hit.t * d;
+    float gap = hit.p.z + 0.1 - dot(DEPTHS, sin(phases(hit.p.xy)));
+    hit.t += gap / speed;
+    if (gap < CLOSE) break;
   }
-  for (int i = 0; i < HALVINGS; i++) {
-    float t = 0.5 * (low + high);
-    vec3 p = o + t * d;
-    if (p.z < folds(p.xy, slope)) high = t; else low = t;
-  }
-  hit.t = high;
-  hit.p = o + high * d;
-  folds(hit.p.xy, slope);
+  hit.p = o + hit.t * d;
+  vec3 k = DEPTHS * cos(phases(hit.p.xy));
+  vec2 slope = k.x * FOLD_A + k.y * FOLD_B + k.z * FOLD_C;
   hit.n = normalize(vec3(-slope, 1));
   hit.tangent = normalize(vec3(1, 0, slope.x));
   hit.uv = vec2(hit.p.x, -hit.p.y) * 0.5 + 0.5;
-  return below && d.z < 0.0 && near > 0.0 && max(abs(hit.p.x), abs(hit.p.y)) <= 1.0;
+  return d.z < 0.0 && near > 0.0 && hit.t <= far && max(abs(hit.p.x), abs(hit.p.y)) <= 1.0;
 }
 #else
 bool trace(vec3 o, vec3 d, out Hit hit) {
