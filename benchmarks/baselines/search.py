@@ -21,7 +21,7 @@ from benchmarks.baselines.train import train
 from nets.training.loader import read_batch, shards
 from nets.training.train import Trainer, keep_memory
 
-CANDIDATES = (5e-4, 1e-3, 2e-3, 4e-3)
+CANDIDATES = (1e-3, 2e-3, 4e-3)
 BATCH = 16  # captures judged together
 
 
