@@ -300,8 +300,8 @@ def export(tell: Tell, folder: str, target: str, options: dict[str, Any]) -> dic
 def tile(tell: Tell, folder: str) -> dict[str, Any]:
     """Pictures of the sample repeated, as it is and seamless, and of its relief."""
     from invrender.data.materials import read_material
-    from invrender.export.height import height_from_normals
     from invrender.export.tileable import make_tileable
+    from invrender.render.height import height_from_normals
     from invrender.report.report import Report
 
     place = Path(folder)

@@ -33,6 +33,9 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--spp", type=int, default=64, help="path tracer's samples (64)")
     parser.add_argument("--noise", type=float, default=0.005, help="of the sensor (0.005)")
     parser.add_argument("--seed", type=int, default=0, help="of everything random (0)")
+    parser.add_argument(
+        "--displaced", action="store_true", help="a surface with heights, not with normals alone"
+    )
     real = parser.add_argument_group(
         "real set-ups", "with --device real display, ball, camera and hands are drawn by the seed"
     )
@@ -103,7 +106,9 @@ def run(args: argparse.Namespace, console: Console) -> int:
     if args.no_screen:
         pattern, rig = NO_PATTERN, without_screen(rig)
     with console.status("path tracing …"):
-        quality: dict[str, Any] = {"width": args.width, "spp": args.spp, "seed": args.seed}
+        quality: dict[str, Any] = {
+            "width": args.width, "spp": args.spp, "seed": args.seed, "displaced": args.displaced,
+        }  # fmt: skip
         if setup is None:
             simulate(
                 args.out, maps, environment, pattern, rig,

@@ -21,6 +21,7 @@ from invrender.files.rig_toml import FOUND_IN_PHOTO, write_rig
 from invrender.files.write import write_exr
 from invrender.lights import IDEAL, Device
 from invrender.maps import Maps
+from invrender.render.height import displaced as relief_of
 from invrender.rig import Rig, fov_of
 from invrender.types import Array, InputError
 
@@ -44,6 +45,7 @@ def simulate(
     seed: int = 0,
     device: Device = IDEAL,
     lamps: Sequence[Lamp] = (),
+    displaced: bool = False,
 ) -> None:
     """Path-trace a capture of a material and write it as a new folder, whole or not at all.
 
@@ -52,7 +54,8 @@ def simulate(
     width: of the 4:3 photo; noise: of the sensor, relative to a pixel's value at the photo's 99th
     percentile (shot noise). A rig that is shifted or tilted makes the photo, but ``rig.toml`` gives
     the nominal one, as a person would; the true one and the device go to ``truth/rig.toml``. lamps:
-    a photo for each, photo_1.exr and so on. Raises
+    a photo for each, photo_1.exr and so on. displaced: the sample is a surface of its normals'
+    heights, which hides and lights itself; the true normals are then that surface's. Raises
     `InputError` for a folder that is not empty. `simulate_real` draws all that real set-ups have.
 
         invrender.simulate("new", maps, room, default_pattern(), Rig(), gain=2.0, noise=0.005)
@@ -60,12 +63,13 @@ def simulate(
     """
     from invrender.render.path_traced import photograph
 
+    relief, maps = relief_of(maps, rig.sample_size) if displaced else (None, maps)
     with _new_capture(folder) as new:
         rng = np.random.default_rng(seed)
         for k, lamp in enumerate(lamps or [None]):
             photo = photograph(
                 rig, maps, pattern, environment, gain, height=width * 3 // 4, width=width, spp=spp,
-                seed=seed + k, device=device, lamp=lamp,
+                seed=seed + k, device=device, lamp=lamp, relief=relief,
             )  # fmt: skip
             if noise > 0:
                 level = max(float(np.percentile(photo, 99)), 1e-12)
@@ -90,6 +94,7 @@ def simulate_real(
     width: int = 1280,
     spp: int = 64,
     seed: int = 0,
+    displaced: bool = False,
 ) -> None:
     """Path-trace a capture as people make them, and write it as a new folder, whole or not at all.
 
@@ -104,11 +109,12 @@ def simulate_real(
     height = width * 3 // 4
     rng = np.random.default_rng([seed, width, spp])
     camera = setup.camera
+    relief, maps = relief_of(maps, setup.rig.sample_size) if displaced else (None, maps)
     with _new_capture(folder) as new:
         units = []
         for k, for_what in enumerate(setup.exposures):
             rig = setup.rig_of(k)
-            light = _light(setup, rig, maps, environment, pattern, width, spp, seed, k)
+            light = _light(setup, rig, maps, environment, pattern, width, spp, seed, k, relief)
             light = seen(camera, light, height, width)
             exposure = _exposure(light, rig, for_what)
             values = developed(camera, light, exposure, rng, clip=setup.photos != "raw")
@@ -129,7 +135,7 @@ def simulate_real(
 
 def _light(
     setup: Setup, rig: Rig, maps: Maps, environment: Array, pattern: Array, width: int, spp: int,
-    seed: int, k: int,
+    seed: int, k: int, relief: Array | None,
 ) -> Array:  # fmt: skip
     """Radiance at photo k's pixels and around them, as `seen` takes it."""
     from invrender.capture.sheet_layout import capture_sheet, draw_sheet
@@ -145,7 +151,7 @@ def _light(
     return photograph(
         replace(rig, fov=fov), maps, pattern, environment, setup.gain, height=high, width=wide,
         spp=spp, seed=seed + k, device=setup.device, ball=setup.ball, ball_alpha=setup.ball_alpha,
-        cover=cover, table=setup.table, lamp=setup.lamps[k] if setup.lamps else None,
+        cover=cover, table=setup.table, lamp=setup.lamps[k] if setup.lamps else None, relief=relief,
     )  # fmt: skip
 
 

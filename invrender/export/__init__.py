@@ -27,7 +27,6 @@ from invrender.export.folders import (
     write_unreal,
 )
 from invrender.export.gltf import move_glb, write_gltf
-from invrender.export.height import height_from_normals
 from invrender.export.material import Material, height_range
 from invrender.export.materialx import write_materialx
 from invrender.export.mitsuba import write_mitsuba
@@ -36,6 +35,7 @@ from invrender.export.tileable import make_tileable
 from invrender.export.usd import write_usd, write_usdz
 from invrender.files.images import read_image
 from invrender.maps import Maps, map_errors
+from invrender.render.height import height_from_normals
 from invrender.rig import Rig
 from invrender.types import Array, InputError
 

@@ -25,6 +25,7 @@ mi.set_log_level(mi.LogLevel.Error)  # it warns of sample counts that it rounds
 
 # Of the screen's size: the table lies so far below the sample, the bezel so far above the lit area.
 SAMPLE_LIFT = 1e-4
+UP = np.array([0, 0, 1], np.float32)
 # A glowing sphere: its centre and radius in metres, its radiance (RGB).
 Lamp = tuple[Vec3, float, Vec3]
 
@@ -226,11 +227,13 @@ def sample_scene(
     integrator: str = "path",
     device: Device = IDEAL,
     lamp: Lamp | None = None,
+    relief: Array | None = None,
 ) -> mi.Scene:
     """The sample, the screen and the environment alone: what the estimators integrate.
 
     The same bilinear pattern and environment, the same pixel-wise constant material. lamp: one that
-    is near, which the estimators do not know.
+    is near, which the estimators do not know. relief: heights (H, W), metres, of a sample that is
+    no plane (`invrender.render.height.displaced`).
     """
     emission = {"emitter_samples": 2, "bsdf_samples": 1}
     choice = emission if integrator == "direct" else {"max_depth": max_depth}
@@ -238,7 +241,7 @@ def sample_scene(
         {
             "type": "scene",
             "integrator": {"type": integrator, **choice},
-            "sample": _sample(rig, maps),
+            "sample": _sample(rig, maps, relief),
             **_lights(rig, pattern, environment, gain, device),
             **_lamp(lamp),
         }
@@ -278,10 +281,44 @@ def scene_dict(maps: Maps, lights: Lights, *, samples: int = 64) -> dict[str, An
     }  # fmt: skip
 
 
-def _sample(rig: Rig, maps: Maps) -> dict[str, Any]:
+def _sample(rig: Rig, maps: Maps, relief: Array | None = None) -> Any:
+    if relief is not None:
+        return _relief(rig, maps, relief)
     half = rig.sample_size / 2
     place = mi.ScalarTransform4f().scale([half, half, 1])
     return {"type": "rectangle", "to_world": place, "bsdf": _bsdf(maps)}
+
+
+def _relief(rig: Rig, maps: Maps, relief: Array) -> Any:
+    """A mesh with a vertex at each pixel's centre, and half a pixel beyond at the border, whose
+    normals are the maps': so its BSDF has none of its own."""
+    height, width = relief.shape
+    half = rig.sample_size / 2
+    at = [np.clip(np.arange(-1, n + 1) + 0.5, 0, n) / n * 2 - 1 for n in (width, height)]
+    x, y = np.meshgrid(at[0] * half, -at[1] * half)
+    z = np.pad(relief, 1, mode="edge")
+    normal = np.pad(maps.normal, ((1, 1), (1, 1), (0, 0)), mode="edge")
+    index = np.arange(z.size).reshape(z.shape)
+    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
+    faces = np.concatenate([np.stack(t, -1).reshape(-1, 3) for t in ((a, c, b), (b, c, d))])
+    flat = Maps(maps.diffuse, maps.specular, maps.roughness, np.zeros_like(maps.normal) + UP)
+    props = mi.Properties()
+    props["bsdf"] = mi.load_dict(_bsdf(flat))
+    mesh = mi.Mesh(
+        "relief", z.size, len(faces), has_vertex_normals=True, has_vertex_texcoords=True,
+        props=props,
+    )  # fmt: skip
+    values = {
+        "vertex_positions": np.stack([x, y, z], -1),
+        "vertex_normals": normal,
+        "vertex_texcoords": np.stack([x, y], -1) / (2 * half) + 0.5,
+    }
+    params = mi.traverse(mesh)
+    for name, value in values.items():
+        params[name] = mi.Float(value.astype(np.float32).ravel())
+    params["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
+    params.update()
+    return mesh
 
 
 def _bsdf(maps: Maps) -> dict[str, Any]:
@@ -413,16 +450,19 @@ def photograph(
     ball_alpha: float = 0.0,
     cover: tuple[Array, tuple[float, float, float, float]] | None = None,
     lamp: Lamp | None = None,
+    relief: Array | None = None,
 ) -> Array:
     """The whole photo (H, W, 3), linear: sample, mirror ball, diffuse table, light between them.
 
     ball: its centre where it is not the rig's; ball_alpha: its roughness. cover: what lies on the
     table under the sample, its reflectance (h, w), row 0 at +y, and its least x, least y, greatest
-    x and greatest y. lamp: in the room.
+    x and greatest y. lamp: in the room. relief: as for `sample_scene`; the table lies
+    below its deepest point.
     """
     size = max(rig.screen_sides) if rig.has_screen else 2 * rig.sample_size
     camera, (right, up, back) = rig.camera, rig.camera_axes
     table = np.broadcast_to(np.asarray(table, dtype=float), 3)
+    depth = SAMPLE_LIFT * size - (0.0 if relief is None else min(float(relief.min()), 0.0))
     scene = mi.load_dict(
         {
             "type": "scene",
@@ -445,11 +485,11 @@ def photograph(
                 },
                 "sampler": {"type": "multijitter", "sample_count": spp},
             },
-            "sample": _sample(rig, maps),
+            "sample": _sample(rig, maps, relief),
             "table": {
                 "type": "rectangle",
                 "to_world": mi.ScalarTransform4f()
-                .translate([0, 0, -SAMPLE_LIFT * size])
+                .translate([0, 0, -depth])
                 .scale([100 * size, 100 * size, 1]),
                 "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(table)}},
             },
@@ -459,7 +499,7 @@ def photograph(
                 "radius": rig.ball_radius,
                 "bsdf": _mirror(rig.ball_reflectance, ball_alpha),
             },
-            **({} if cover is None else {"cover": _paper(*cover, SAMPLE_LIFT * size / 2)}),
+            **({} if cover is None else {"cover": _paper(*cover, depth - SAMPLE_LIFT * size / 2)}),
             **_lights(rig, pattern, environment, gain, device),
             **_lamp(lamp),
         }

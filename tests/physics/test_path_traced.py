@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from forward_scenes import rendered, some_environment, some_maps, some_pattern
@@ -99,3 +101,47 @@ def test_a_result_is_a_mitsuba_scene_in_one_call():
     parameters.update()
     dr.backward(dr.mean(mi.render(scene, parameters, spp=4)))
     assert np.abs(np.array(dr.grad(parameters[keys[0]]))).max() > 0
+
+
+def test_a_ramp_is_a_plane_whose_normals_lean():
+    """Under distant light only the normal counts; a relief's triangles face as its heights say."""
+    rig, n, slope = without_screen(Rig()), 12, 0.2
+    x = rig.sample_points(n, n)[..., 0]
+    env = some_environment(sun=0)
+    lean = np.array([-slope, 0, 1]) / np.hypot(slope, 1)
+    flat = constant_maps(n, n, diffuse=0.6, specular=0.04, roughness=0.6)
+    leaning = replace(flat, normal=np.broadcast_to(lean, (n, n, 3)).astype(np.float32))
+    options = {"spp": 128, "height": 240, "width": 240, "table": 0.0, "max_depth": 2}
+    seen = [
+        sample_region(rig, photograph.photograph(rig, maps, None, env, relief=relief, **options), 4)
+        for maps, relief in ((leaning, None), (leaning, slope * x), (flat, 0 * x))
+    ]
+    by_normals, by_heights, even = (s[1:-1, 1:-1] for s in seen)
+    np.testing.assert_allclose(by_heights.mean((0, 1)), by_normals.mean((0, 1)), rtol=0.02)
+    assert np.abs(even.mean((0, 1)) / by_normals.mean((0, 1)) - 1).max() > 0.04
+
+
+def test_a_groove_hides_the_sky_from_itself():
+    """Of an even sky a V-shaped groove's walls, inclined by a, receive cos a: their opening's width
+    over theirs. Normals alone would say (1 + cos a) / 2."""
+    rig, n, wall = without_screen(Rig()), 96, 6
+    pixel = rig.sample_size / n
+    up = (np.arange(n) // wall) % 2 == 0
+    slope = np.where(up, 1.0, -1.0)
+    height = np.cumsum(slope) * pixel
+    relief = np.tile(height - height.mean(), (n, 1))
+    normal = np.stack([-slope, 0 * slope, 1 + 0 * slope], -1) / np.sqrt(2)
+    white = constant_maps(n, n, diffuse=1.0, specular=0.0, roughness=1.0)
+    grooved = replace(white, normal=np.tile(normal, (n, 1, 1)).astype(np.float32))
+    sky = np.ones((16, 32, 3))
+    sky[8:] = 0
+    seen = []
+    for maps, heights in ((white, None), (grooved, None), (grooved, relief)):
+        scene = photograph.sample_scene(rig, maps, None, sky, relief=heights)
+        # A shift: rays through the mesh's vertices may pass between its triangles.
+        moved = replace(rig, camera_shift=(0.21 * pixel, 0.13 * pixel, 0.0))
+        image = photograph.path_traced(scene, moved, n, n, 32)
+        seen.append(float(image[n // 4 : -n // 4, 2 * wall : -2 * wall].mean()))
+    flat, normals, heights = seen
+    assert normals / flat == pytest.approx((1 + np.sqrt(0.5)) / 2, rel=0.04)
+    assert heights / flat == pytest.approx(np.sqrt(0.5), rel=0.04)

@@ -10,6 +10,7 @@ import pytest
 from benchmarks.common.tables import filled
 from invrender.cli.main import main
 from invrender.data.environments import procedural_environment
+from invrender.data.materials import procedural_material
 from invrender.data.simulate import simulate_real
 from invrender.data.simulate_camera import (
     HALF_WIDTH,
@@ -22,11 +23,13 @@ from invrender.data.simulate_camera import (
 )
 from invrender.data.simulate_setup import RANGES, draw_setup, hides
 from invrender.files.images import read_image, read_photo
+from invrender.files.maps import read_maps
 from invrender.files.rig_toml import read_rig
 from invrender.lights import Lights
 from invrender.maps import constant_maps
 from invrender.pattern.default import default_pattern
 from invrender.render.fast.estimator import Fast
+from invrender.render.height import displaced
 from invrender.sphere import scale_environment
 from invrender.types import InputError
 
@@ -156,3 +159,14 @@ def test_the_command_writes_a_bracket(tmp_path, capsys):
     assert bright > 1.2 * dark
     assert main([*command, "--sheet"]) == 2
     assert "belong to --device real" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("device", ["ideal", "real"])
+def test_a_displaced_sample_has_a_surfaces_normals(tmp_path, device):
+    out = tmp_path / "b"
+    command = ["simulate", "-o", str(out), "--kind", "bricks", "--size", "32", "--width", "96"]
+    assert main([*command, "--spp", "2", "--device", device, "--displaced"]) == 0
+    drawn = procedural_material(0, 32, 32, kind="bricks")
+    of_surface = displaced(drawn, 0.09)[1].normal
+    assert np.abs(of_surface - drawn.normal).mean() > 0.01
+    np.testing.assert_allclose(read_maps(out / "truth").normal, of_surface, atol=2e-3)

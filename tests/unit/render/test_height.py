@@ -1,12 +1,14 @@
 """Heights against surfaces that are known, and seamless maps."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from invrender.data.materials import procedural_material
-from invrender.export.height import height_from_normals
 from invrender.export.tileable import make_tileable
 from invrender.maps import constant_maps, crop_maps
+from invrender.render.height import displaced, height_from_normals
 from invrender.types import InputError
 
 SIDE = 0.09  # metres
@@ -90,3 +92,28 @@ def test_constant_maps_stay():
     assert np.allclose(tiled.diffuse, 0.5) and seams.after == 0
     with pytest.raises(InputError):
         make_tileable(constant_maps(8, 8))
+
+
+def test_displaced_normals_are_those_of_a_surface():
+    """Of normals that no surface has the rest is left out: what is left is a surface's own."""
+    rng = np.random.default_rng(3)
+    slope = 0.2 * rng.standard_normal((24, 24, 2))
+    normal = np.concatenate([slope, np.ones((24, 24, 1))], -1)
+    normal = (normal / np.linalg.norm(normal, axis=-1, keepdims=True)).astype(np.float32)
+    maps = replace(constant_maps(24, 24), normal=normal)
+    height, of_surface = displaced(maps, 0.09)
+    down, right = np.gradient(height / (0.09 / 24))
+    np.testing.assert_allclose(
+        -of_surface.normal[..., 0] / of_surface.normal[..., 2], right, atol=1e-4
+    )
+    np.testing.assert_allclose(
+        of_surface.normal[..., 1] / of_surface.normal[..., 2], down, atol=1e-4
+    )
+    assert abs(height.mean()) < 1e-7
+    bowl = np.add.outer(np.linspace(-1, 1, 32) ** 2, np.linspace(-1, 1, 32) ** 2) * 0.004
+    down, right = np.gradient(bowl / (0.09 / 32))
+    normal = np.stack([-right, down, np.ones_like(bowl)], -1)
+    normal = (normal / np.linalg.norm(normal, axis=-1, keepdims=True)).astype(np.float32)
+    height, same = displaced(replace(constant_maps(32, 32), normal=normal), 0.09)
+    np.testing.assert_allclose(height, bowl - bowl.mean(), atol=2e-5)
+    assert (same.normal * normal).sum(-1)[1:-1, 1:-1].min() > 0.9999

@@ -10,11 +10,12 @@ a survey"]; it is solved by alternating directions (ADMM), a Poisson equation ea
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import fft
 
+from invrender.maps import Maps, unit_normals
 from invrender.types import Array
 
 STEEPEST = 10.0  # slope, 84°: what normals nearer to the horizon are taken for
@@ -57,6 +58,16 @@ def height_from_normals(
         float(np.sqrt(np.mean(errors**2))) if errors.size else 0.0,
         float(np.mean(np.abs(errors) > 0.1)) if errors.size else 0.0,
     )
+
+
+def displaced(maps: Maps, side: float) -> tuple[Array, Maps]:
+    """Heights (H, W), metres about their mean, of a sample ``side`` metres wide with the maps'
+    relief, and the maps with that surface's normals: of theirs, what a surface can have."""
+    pixel = side / maps.shape[1]
+    height = height_from_normals(maps.normal, pixel).height
+    down, right = np.gradient(height / pixel) if min(maps.shape) > 1 else 2 * [0 * height]
+    normal = np.stack([-right, down, np.ones_like(height)], -1).astype(np.float32)
+    return height, replace(maps, normal=unit_normals(normal))
 
 
 def _between(slope: Array, axis: int, periodic: bool) -> Array:
