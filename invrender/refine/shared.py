@@ -17,7 +17,7 @@ it counts little (Student's t).
   radiance is a guess, but not the place: they have a factor of their own, and the room none of
   their doubt. Lights that are known are no unknowns, and cost nothing.
 - **Dielectrics** mirror alike in all colours and places. A network's f0 follows the light's
-  pattern, and the roughness with it: before anything is fitted f0 becomes the sample's median.
+  pattern, and the roughness with it: before anything is fitted f0 becomes the usual one.
 - **Relief** that the maps do not resolve widens the lobe, like a greater roughness. What the photo
   asks for is shared out between the two by their variances.
 """
@@ -32,6 +32,7 @@ from typing import Any
 
 import numpy as np
 
+from invrender.refine.flat import USUAL_SPECULAR
 from invrender.refine.gauss_newton import BAND, Observation, linearise
 from invrender.refine.groups import group
 from invrender.refine.priors import Prior, channel_correlation
@@ -64,8 +65,8 @@ class Settings:
     least_fill: float = 0.05  # of a part that a material has
     # what a material is off by
     shared_diffuse: tuple[float, float] = (0.01, 0.1)
-    shared_specular: tuple[float, float] = (0.004, 0.2)
-    shared_roughness: float = 0.08
+    shared_specular: tuple[float, float] = (0.002, 0.2)
+    shared_roughness: float = 0.05
     alike: tuple[float, float] = (0.9, 0.3)  # correlation of materials: of one kind; of two
     # what a part is off by
     part_diffuse: tuple[float, float] = (0.013, 0.1)
@@ -161,13 +162,10 @@ def light_doubt(fit: dict[str, float], s: Settings = SHARED_SETTINGS) -> tuple[f
 
 
 def plain_dielectric(theta: Array, s: Settings = SHARED_SETTINGS) -> Array:
-    """Maps θ in which every dielectric has the sample's median f0, grey; in place."""
-    f0 = theta[..., S].mean(-1)
+    """Maps θ in which every dielectric has the usual f0, grey; in place."""
+    f0 = theta[..., S].mean(-1, keepdims=True)
     low, high = s.dielectric_f0
-    sure = f0 < low
-    if sure.any():
-        weight = np.clip((high - f0) / (high - low), 0, 1)[..., None]
-        theta[..., S] += weight * (np.median(f0[sure]) - theta[..., S])
+    theta[..., S] += np.clip((high - f0) / (high - low), 0, 1) * (USUAL_SPECULAR - theta[..., S])
     return theta
 
 

@@ -165,9 +165,9 @@ def test_deviations_of_a_material():
     sigma = shared.shared_sigma(theta)
     np.testing.assert_allclose(sigma[..., D], 0.01 + 0.1 * 0.4, rtol=1e-5)
     np.testing.assert_allclose(
-        sigma[0, :, 3], (0.004, 0.004 + 0.2 * 0.21 / 2, 0.004 + 0.2 * 0.8), rtol=1e-5
+        sigma[0, :, 3], (0.002, 0.002 + 0.2 * 0.21 / 2, 0.002 + 0.2 * 0.8), rtol=1e-5
     )
-    np.testing.assert_allclose(sigma[..., R], 0.08)
+    np.testing.assert_allclose(sigma[..., R], 0.05)
 
 
 def test_contrast_is_with_neighbours():

@@ -250,7 +250,7 @@ def test_dielectric_mirrors_alike():
     maps.specular[:, ::2] = (0.05, 0.03, 0.02)
     maps.specular[:4] = (0.9, 0.7, 0.4)
     theta = plain_dielectric(to_theta(maps))
-    assert np.ptp(theta[4:, :, S]) < 1e-6 and 0.03 < theta[10, 0, 3] < 0.041
+    assert np.ptp(theta[4:, :, S]) < 1e-6 and theta[10, 0, 3] == np.float32(0.04)
     np.testing.assert_allclose(theta[:4, :, S], maps.specular[:4])
     assert (theta[..., D] == to_theta(maps)[..., D]).all()
 
