@@ -92,8 +92,8 @@ class Lights:
 
     What `invrender.find_lights` adds of a photo's mirror ball. coverage: (H, 2H), the share of each
     texel of the environment that the ball really shows, the rest is filled in. lamps: (H, 2H, 3),
-    what of the environment is light of saturated lamps, whose radiance the ball does not tell; None
-    where there are none. pattern_captured:
+    what of the environment is light of saturated lamps or one behind the screen, whose radiance the
+    ball does not tell; None where there are none. pattern_captured:
     (P, P, 3), the screen's radiance as the ball shows it. fit: how well all of it fits, by name:
     ``residual`` of the pattern relative to the gain, ``gain_deviation`` the standard deviation of
     the logarithm of the screen's light, ``gamma`` and ``falloff`` the device's, ``blur`` the

@@ -203,7 +203,10 @@ def _measure(
     if fit["room_raised"] == 1 and screen.saturated <= SCREEN_FIT.saturated:  # the light is known
         fit["vignetting"] = find_vignetting(photo, rig, ball, lit, environment)
         photo = without_vignetting(photo, fit["vignetting"])
-    environment, fit["hidden_lamp"] = add_hidden_lamp(photo, rig, ball, lit, environment, coverage)
+    shown = environment
+    environment, fit["hidden_lamp"] = add_hidden_lamp(photo, rig, ball, lit, shown, coverage)
+    if fit["hidden_lamp"] > 1:
+        lamps = environment - shown
     size = min(PATTERN_CHECK.captured_size, max(capture.pattern.shape[:2]))
     captured = unfold_pattern(photo, rig, ball, size)
     lights = Lights(

@@ -35,9 +35,11 @@ class Response:
     @property
     def is_likely(self) -> bool:
         """Whether a camera has such a curve: it rises everywhere, and flattens towards white."""
-        steps = np.diff(np.log(TONE_CURVE.knots))
-        rises = (np.diff(self.logarithms) > (TONE_CURVE.least_slope - 1) * steps).all()
-        return bool(rises and self.logarithms[TONE_CURVE.white] < TONE_CURVE.shoulder)
+        slopes = 1 + np.diff(self.logarithms) / np.diff(np.log(TONE_CURVE.knots))
+        steeper = np.diff(slopes[TONE_CURVE.fixed : TONE_CURVE.white]).max()
+        flattens = self.logarithms[TONE_CURVE.white] < TONE_CURVE.shoulder
+        rises = slopes.min() > TONE_CURVE.least_slope
+        return bool(rises and flattens and steeper < TONE_CURVE.steeper)
 
     def undo(self, photo: Photo) -> Photo:
         """The photo as the light was, linear."""

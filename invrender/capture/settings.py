@@ -440,6 +440,9 @@ class ToneCurve:
     # Of that knot's logarithm, at most: a camera's curve flattens there. Of eight straight files
     # the fit's was -0.09 at least, of twelve curved ones -0.15 at most.
     shoulder: float = -0.12
+    # By how much a slope between grey and white may exceed the one before it; a false curve's did
+    # by 0.95. By hand.
+    steeper: float = 0.4
     fixed_deviation: float = 1e-3  # of its logarithm; by hand
     slope_deviation: float = 0.5  # of the curve's slope about 1; by hand
     bend_deviation: float = 0.4  # of the slope's change from knot to knot; by hand
