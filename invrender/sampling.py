@@ -80,13 +80,6 @@ def knot_shares(x: Array, knots: Array) -> Array:
     return np.stack([np.interp(x, knots, row) for row in np.eye(len(knots))], -1)
 
 
-def knot_slopes(knots: Array) -> tuple[Array, Array]:
-    """Rows that make of the values at ``knots`` (k,) the slopes between them, (k - 1, k), and what
-    these change by at each inner knot, (k - 2, k)."""
-    slopes = np.diff(np.eye(len(knots)), axis=0) / np.diff(knots)[:, None]
-    return slopes, np.diff(slopes, axis=0)
-
-
 def parabola_top(values: Array, i: int) -> float:
     """How far beside its greatest value, at ``i``, a parabola through three has its top."""
     if not 0 < i < len(values) - 1:

@@ -24,7 +24,7 @@ from invrender.capture.settings import CROPPING, RIM_FIT, SQUARE_FIT
 from invrender.files.images import Photo
 from invrender.rig import Rig
 from invrender.sampling import parabola_top
-from invrender.types import Array, InputError
+from invrender.types import Array, InputError, Mask
 
 
 def is_whole(photo: Photo) -> bool:
@@ -59,8 +59,11 @@ def _find(photo: Photo, rig: Rig) -> Array | None:
     views = [_view(photo, rig, pixels) for pixels, *_ in SQUARE_FIT.passes]
     nominal = _sides(views[-1], rig)
     pose: Array = np.zeros(6)
-    if np.all(nominal.median > SQUARE_FIT.nominal):  # all four: no need to look elsewhere
-        return pose
+    if np.all(nominal.median > SQUARE_FIT.nominal) and nominal.clear():
+        return pose  # all four: no need to look elsewhere
+    border = _border(views, rig)
+    if border is not None:
+        return border
     misfit = 0.0
     passes = zip(views, SQUARE_FIT.passes, strict=True)
     for view, (_, reach, turns, askew, step, *deviations) in passes:
@@ -81,9 +84,39 @@ def _find(photo: Photo, rig: Rig) -> Array | None:
     if not likely:
         return None
     for _ in range(2):
-        border = _outermost(view, _ends(view, _posed(rig, pose)))
-        pose = pose + _solve(_slopes(view, rig, pose), pose, *border)
+        wanted, deviation, _ = _outermost(view, _ends(view, _posed(rig, pose)))
+        pose = pose + _solve(_slopes(view, rig, pose), pose, wanted, deviation)
     return pose
+
+
+def _border(views: list[View], rig: Rig) -> Array | None:
+    """The camera's pose from the outermost changes near the nominal square, where the table beside
+    it is plain; None where these are no square."""
+    pose, seen = np.zeros(6), np.zeros(4, bool)
+    for view, (pixels, reach, *_) in zip(views, SQUARE_FIT.passes, strict=True):
+        near = pixels * reach if view is views[0] else None
+        for _ in range(2):
+            if not _inside(view, _ends(view, _posed(rig, pose))):
+                return None
+            ends = _ends(view, _posed(rig, pose))
+            wanted, deviation, seen = _outermost(view, ends, near)
+            if seen.sum() < 3:
+                return None
+            near, slopes = None, _slopes(view, rig, pose)
+            move, misfit = _fitted(slopes, pose, wanted, deviation)
+            if misfit > SQUARE_FIT.greatest_misfit:  # one may be the display's edge
+                without = np.repeat(np.where(np.eye(4), SQUARE_FIT.left_out, 1.0), 2, 1)
+                move, misfit = min(
+                    (_fitted(slopes, pose, wanted, deviation * w) for w in without),
+                    key=lambda f: f[1] + float(((pose + f[0]) ** 2).sum()),
+                )
+            if misfit > SQUARE_FIT.greatest_misfit:
+                return None
+            pose = pose + move
+    if pose @ pose > SQUARE_FIT.greatest_pose:
+        return None
+    clear = seen.all() or _sides(views[-1], _posed(rig, pose)).clear()
+    return pose if clear else None
 
 
 def _in_photo(photo: Photo, at: Array) -> bool:
@@ -168,17 +201,27 @@ def _solve(slopes: Array, pose: Array, wanted: Array, deviation: Array) -> Array
     return np.asarray((wanted @ (weight[:, None] * slopes) - pose) @ np.linalg.inv(matrix))
 
 
-def _outermost(view: View, ends: Array) -> tuple[Array, Array]:
-    """Where the sides' outermost changes lie, place and slope, and the deviations of these, (8,).
+def _fitted(slopes: Array, pose: Array, wanted: Array, deviation: Array) -> tuple[Array, float]:
+    """The most probable move of a pose, and the squared misfit of places and slopes then."""
+    move = _solve(slopes, pose, wanted, deviation)
+    return move, float((((wanted - slopes @ move) / deviation) ** 2).sum())
+
+
+def _outermost(view: View, ends: Array, reach: float | None = None) -> tuple[Array, Array, Mask]:
+    """Where the sides' outermost changes lie, place and slope, and the deviations of these, (8,);
+    and of which sides (4,) most points lie on a line.
 
     A sample has lines beside its border, a plain table has none: from outside inwards the first
     change that is larger than the table's is the border. A side beside a table that changes as much
-    stays.
+    stays. reach: pixels to either side that are searched, those of `SQUARE_FIT.outward` if
+    None.
     """
     inwards, outwards, border = SQUARE_FIT.outward
-    t = np.arange(inwards, outwards) * 0.5
+    if reach is not None:
+        inwards, outwards, border = -reach, reach + outwards - border, reach
+    t = np.arange(inwards, outwards, 0.5)
     outside, near = t >= border, np.flatnonzero(t <= border)
-    wanted = np.zeros((4, 2))
+    wanted, lines = np.zeros((4, 2)), np.zeros(4, bool)
     deviation = np.tile(np.array(SQUARE_FIT.passes[-1][-2:]) / 2, (4, 1))
     for k, side in enumerate(ends):
         change, u = _changes(view, side, t, SQUARE_FIT.blur)
@@ -196,9 +239,21 @@ def _outermost(view: View, ends: Array) -> tuple[Array, Array]:
             weight = 1 / (1 + (peak[some] - a @ line) ** 2)
             matrix = a.T @ (weight[:, None] * a) + SQUARE_FIT.ridge * np.eye(2)
             line = np.linalg.solve(matrix, a.T @ (weight * peak[some]))
-        if np.sum(np.abs(peak[some] - a @ line) < 1) > SQUARE_FIT.most * len(u):
-            wanted[k], deviation[k] = line, SQUARE_FIT.border_deviation
-    return wanted.ravel(), deviation.ravel()
+        on = np.sum(np.abs(peak[some] - a @ line) < 1) > SQUARE_FIT.most * len(u)
+        if on and (reach is None or _is_step(change, t, line[0] + line[1] * (u - 0.5))):
+            wanted[k], deviation[k], lines[k] = line, SQUARE_FIT.border_deviation, True
+    return wanted.ravel(), deviation.ravel(), lines
+
+
+def _is_step(change: Array, t: Array, at: Array) -> bool:
+    """Whether the tone is another one on the two sides of a line, as no joint between tiles has it:
+    ``change`` (3, n, points) at distances t (n,), the line's (points,)."""
+    tone = np.cumsum(change, 1) * (t[1] - t[0])
+    places = at + SQUARE_FIT.beside * np.array([[-1], [1], [3]])
+    rows = np.clip(np.searchsorted(t, places), 0, len(t) - 1)
+    inside, table, beyond = (tone[:, row, np.arange(len(at))] for row in rows)
+    step, even = (np.median(np.linalg.norm(d, axis=0)) for d in (inside - table, table - beyond))
+    return bool(step > SQUARE_FIT.clear * even)
 
 
 def _normals(ends: Array) -> Array:
@@ -277,8 +332,10 @@ def _side(view: View, side: Array) -> tuple[Any, ...]:
     t = np.arange(-reach, reach + 1) * 0.5
     change, _ = _changes(view, side, t, SQUARE_FIT.blur)
     power = _power(_even(change))
-    on, beside = power[np.abs(t) <= within].max(0), power[np.abs(t) >= beyond]
-    levels = (np.quantile(beside, q, axis=0) + least for q in (0.5, tenth))
+    on = power[np.abs(t) <= within].max(0)
+    # The sample may have lines of its own: the greatest changes that count are the table's.
+    median = np.quantile(power[np.abs(t) >= beyond], 0.5, axis=0) + least
+    levels = median, np.quantile(power[t >= beyond], tenth, axis=0) + least
     most = np.abs(t[np.argmax((change**2).sum(0), 0)]) <= SQUARE_FIT.peak_on
     reach, within, beyond = SQUARE_FIT.wide
     t = np.arange(-reach, reach + 1.0)

@@ -77,6 +77,7 @@ def find_lights(
     if not capture.rig.has_screen:
         gain = 0.0
     if environment is not None and gain is not None:
+        capture = replace(capture, photo=capture.photo.in_rec709())
         if sheet is None:
             capture = replace(capture, rig=find_camera(capture.photo, capture.rig)[0])
         lights = Lights(
@@ -96,12 +97,13 @@ def find_lights(
             seen = replace(seen, photo=response.undo(seen.photo))
             found = measure_reflectance(seen.photo, seen.rig, found)
             capture, mirror = use_reflectance(seen, found)
-            lights, _ = _measure(capture, found, curve=False)
+            lights, _ = _measure(capture, found)
             mirror = (*mirror, Notice("photo-curve", CURVE_TEXT))
             sheet = undone(sheet, response)
         lights, paper = use_paper(sheet, lights, found)
         photo = without_vignetting(capture.photo, lights.fit["vignetting"])
-        capture = replace(capture, photo=photo)
+        lights = _in_rec709(lights, photo.matrix)
+        capture = replace(capture, photo=photo.in_rec709())
     if environment is not None:
         lights = replace(lights, environment=environment)
     if gain is not None:
@@ -111,6 +113,27 @@ def find_lights(
         *light_warnings(lights),
     )  # fmt: skip
     return FoundLights(capture, lights, found, notices, sheet)
+
+
+def _in_rec709(lights: Lights, matrix: Array | None) -> Lights:
+    """The lights in Rec. 709 that were found in primaries from which ``matrix`` (3, 3) leads there:
+    the display's white stays white, and its channels mix otherwise."""
+    if matrix is None:
+        return lights
+    room, lamps, seen = (
+        None if a is None else np.maximum(a @ matrix.T, 0).astype(np.float32)
+        for a in (lights.environment, lights.lamps, lights.pattern_captured)
+    )
+    assert room is not None
+    lights = replace(lights, environment=room, lamps=lamps, pattern_captured=seen)
+    if not np.any(lights.gain):
+        return lights
+    by_channel = matrix @ (_rgb(lights.gain)[:, None] * np.asarray(lights.device.mixing))
+    by_channel = np.maximum(by_channel, 0)
+    white = by_channel.sum(1)
+    red, green, blue = ((r, g, b) for r, g, b in (by_channel / white[:, None]).tolist())
+    device = replace(lights.device, mixing=(red, green, blue))
+    return replace(lights, gain=white.astype(np.float32), device=device)
 
 
 def _rgb(gain: Any) -> Array:
@@ -161,11 +184,11 @@ def measure_lights(capture: Capture, ball: Ball, height: int = UNFOLDING.height)
 
     The photo counts as linear: `find_lights` undoes a tone curve before.
     """
-    return _measure(capture, ball, height, curve=False)[0]
+    return _measure(replace(capture, photo=replace(capture.photo, linear=True)), ball, height)[0]
 
 
 def _measure(
-    capture: Capture, ball: Ball, height: int = UNFOLDING.height, *, curve: bool = True
+    capture: Capture, ball: Ball, height: int = UNFOLDING.height
 ) -> tuple[Lights, Response | None]:
     """The lights, and the photo's tone curve where there is one, in which case the lights are not
     worth much before that is undone."""
@@ -178,7 +201,7 @@ def _measure(
     photo = remove_glare(capture.photo, rig, image)
     if not rig.has_screen:
         return _measure_room(capture, photo, rig, image, height), None
-    screen = fit_screen(photo, rig, image, capture.pattern, capture.device, curve=curve)
+    screen = fit_screen(photo, rig, image, capture.pattern, capture.device)
     lit = capture.pattern, screen.gain, screen.device
     fit = _fit_numbers(screen, rig)
     if _shows_another_pattern(screen, ball):
@@ -192,9 +215,8 @@ def _measure(
     fit["room_saturated"] = _room_saturated(photo, rig, image)
     environment, coverage = unfold_environment(photo, rig, image, height, screen.blur)
     environment, fit["room_raised"], factor, lamps = raise_clipped(
-        photo, rig, image, lit, environment, coverage,
-        screen.gain_deviation if screen.saturated > SCREEN_FIT.saturated else 0.0,
-    )  # fmt: skip
+        photo, rig, image, lit, environment, coverage, screen.gain_deviation
+    )
     gain = screen.gain * factor
     fit["gain_by_table"] = float(factor.mean())
     lit = capture.pattern, gain, screen.device

@@ -8,16 +8,20 @@ import numpy as np
 
 from invrender.capture.settings import TONE_CURVE
 from invrender.files.images import Photo
-from invrender.sampling import knot_shares, knot_slopes
+from invrender.files.tone_curves import FIXED, KNOTS, curve_prior
+from invrender.sampling import knot_shares
 from invrender.types import Array
+
+LOG_KNOTS = np.log(KNOTS)
 
 
 @dataclass(frozen=True)
 class Response:
-    """What a camera makes of light before it is encoded: x becomes x·exp(c(log x)).
+    """What a camera makes of light before it is encoded: the value v is of the light
+    v·exp(c(log v)).
 
-    c is linear between `TONE_CURVE.knots` (of linear values, 1 is white), has the given
-    ``logarithms`` there, and is constant beyond. The same for all channels.
+    c is linear between `invrender.files.tone_curves.KNOTS`, has the given ``logarithms`` there, and
+    is constant beyond. The same for all channels.
     """
 
     logarithms: tuple[float, ...]
@@ -25,31 +29,33 @@ class Response:
     def apply(self, light: Array) -> tuple[Array, Array]:
         """Values (...) that the file has for light (...); and how steep the curve is there, in
         logarithms: 1 where it is straight."""
-        knots = np.log(TONE_CURVE.knots)
         log = np.log(np.maximum(light, TONE_CURVE.darkest))
-        curved = light * np.exp(np.interp(log, knots, self.logarithms))
-        slopes = np.diff(self.logarithms) / np.diff(knots)
-        steep = 1 + np.concatenate([[0], slopes, [0]])[np.searchsorted(knots, log)]
-        return np.asarray(curved), np.asarray(steep)
+        steps = np.diff(LOG_KNOTS + self.logarithms)
+        steps = np.maximum(steps, TONE_CURVE.least_slope * np.diff(LOG_KNOTS))
+        lights = LOG_KNOTS[0] + self.logarithms[0] + np.concatenate([[0], np.cumsum(steps)])
+        value = np.interp(log, lights, LOG_KNOTS)
+        value += np.minimum(log - lights[0], 0) + np.maximum(log - lights[-1], 0)
+        slopes = np.concatenate([[1], np.diff(LOG_KNOTS) / steps, [1]])
+        return np.exp(value), slopes[np.searchsorted(lights, log)]
 
     @property
     def is_likely(self) -> bool:
         """Whether a camera has such a curve: it rises everywhere, and flattens towards white."""
-        slopes = 1 + np.diff(self.logarithms) / np.diff(np.log(TONE_CURVE.knots))
-        steeper = np.diff(slopes[TONE_CURVE.fixed : TONE_CURVE.white]).max()
-        flattens = self.logarithms[TONE_CURVE.white] < TONE_CURVE.shoulder
-        rises = slopes.min() > TONE_CURVE.least_slope
-        return bool(rises and flattens and steeper < TONE_CURVE.steeper)
+        lights = np.diff(LOG_KNOTS + self.logarithms)
+        if (lights <= TONE_CURVE.least_slope * np.diff(LOG_KNOTS)).any():
+            return False
+        slopes = np.diff(LOG_KNOTS) / lights
+        steeper = np.diff(slopes[FIXED:]).max()
+        return bool(self.logarithms[-1] > TONE_CURVE.shoulder and steeper < TONE_CURVE.steeper)
 
     def undo(self, photo: Photo) -> Photo:
         """The photo as the light was, linear."""
-        knots = np.asarray(TONE_CURVE.knots)
-        curved = np.log(knots) + self.logarithms
 
         def linear(values: Array) -> Array:
             log = np.log(np.maximum(values, TONE_CURVE.darkest))
-            off = np.interp(log, curved, self.logarithms)
-            return np.asarray(values * np.exp(-off), np.float32)
+            return np.asarray(
+                values * np.exp(np.interp(log, LOG_KNOTS, self.logarithms)), np.float32
+            )
 
         level = photo.clip_level
         if level is not None:
@@ -57,24 +63,17 @@ class Response:
         image = np.concatenate(
             [linear(part) for part in np.array_split(photo.image, TONE_CURVE.parts)]
         )
-        return replace(photo, image=image, clip_level=level)
+        return replace(photo, image=image, clip_level=level, linear=True)
 
 
-def curve_shares(light: Array) -> Array:
-    """How much of each knot's logarithm the light (...) has, (..., knots)."""
-    knots = np.log(TONE_CURVE.knots)
-    log = np.log(np.maximum(light, TONE_CURVE.darkest))
-    return knot_shares(log, knots)
+def curve_shares(values: Array) -> Array:
+    """How much of each knot's logarithm the values (...) of a file have, (..., knots)."""
+    return knot_shares(np.log(np.maximum(values, TONE_CURVE.darkest)), LOG_KNOTS)
 
 
-def curve_precision() -> Array:
-    """Inverse covariance of the logarithms: small slopes that change little, nought at the fixed
-    knot."""
-    knots = np.log(TONE_CURVE.knots)
-    slope, bend = knot_slopes(knots)
-    fixed = np.zeros((1, len(knots)))
-    fixed[0, TONE_CURVE.fixed] = 1 / TONE_CURVE.fixed_deviation
-    rows = np.concatenate(
-        [slope / TONE_CURVE.slope_deviation, bend / TONE_CURVE.bend_deviation, fixed]
-    )
-    return np.asarray(rows.T @ rows)
+def likely_curves() -> tuple[Array, Array]:
+    """Mean (knots,) and inverse covariance (knots, knots) of the logarithms, of cameras' curves."""
+    mean, covariance = curve_prior(np.asarray(KNOTS), FIXED)
+    fixed = np.zeros(len(KNOTS))
+    fixed[FIXED] = 1 / TONE_CURVE.fixed_deviation**2
+    return mean, np.linalg.inv(covariance) + np.diag(fixed)

@@ -22,10 +22,11 @@ from scipy.spatial.transform import Rotation
 
 from invrender.capture.ball_image import BallImage, screen_coordinates, trace_ball
 from invrender.capture.least_squares import minimise
-from invrender.capture.response import Response, curve_precision, curve_shares
+from invrender.capture.response import Response, curve_shares, likely_curves
 from invrender.capture.robust import spread as robust_spread
-from invrender.capture.settings import DISPLAY, JPEG_GAMMA, JPEG_LUMA, SCREEN_FIT, TONE_CURVE
+from invrender.capture.settings import DISPLAY, JPEG_GAMMA, JPEG_LUMA, SCREEN_FIT
 from invrender.files.images import Photo
+from invrender.files.tone_curves import KNOTS
 from invrender.lights import GAMMAS, IDEAL, Device
 from invrender.rig import Rig
 from invrender.sampling import resize_pattern
@@ -64,8 +65,6 @@ def fit_screen(
     image: BallImage,
     pattern: Array,
     device: Device = IDEAL,
-    *,
-    curve: bool = True,
 ) -> Screen:
     """Register the ``pattern`` (h, w, 3), relative radiance, with the ball's image of the screen.
 
@@ -74,7 +73,7 @@ def fit_screen(
     `SCREEN_FIT.poor`, or the screen is saturated, its pose and the display's curve are fitted too;
     where more than `SCREEN_FIT.no_curve` is saturated the curve cannot be told from the gain and is
     taken as straight. Then what the errors ask for: the display's other properties, and an 8-bit
-    file's tone curve, unless ``curve`` is false. Raises `InputError` if the ball cannot show the
+    file's tone curve, unless the photo is linear. Raises `InputError` if the ball cannot show the
     screen, or shows it saturated or dark.
     """
     fit = _Fit(photo, rig, image, pattern, device)
@@ -85,7 +84,9 @@ def fit_screen(
     if ideal.residual < SCREEN_FIT.poor and ideal.saturated < SCREEN_FIT.saturated:
         return ideal
     fit.free[:_COLOUR] = True
-    fit.free[_GAMMA] = ideal.saturated < SCREEN_FIT.no_curve
+    fit.free[_GAMMA] = ideal.saturated < SCREEN_FIT.no_display
+    if ideal.saturated >= SCREEN_FIT.no_curve:
+        fit.set_gamma_prior(DISPLAY.gamma_deviation)
     if not fit.free[_GAMMA.start]:  # what is left of the screen tells little of its colour
         fit.prior[_GAIN, _GAIN] = _APART / SCREEN_FIT.white_deviation**2
     start = u
@@ -94,13 +95,15 @@ def fit_screen(
         for blurred, least in SCREEN_FIT.stages[first:]:
             u = fit.solve(u, blurred * max(1.0, fit.radius / SCREEN_FIT.stage_radius), least)
         better = fit.cost(start) - fit.cost(u) > SCREEN_FIT.better
+        # A screen far off has another room behind it, under which the nominal one may look worse.
+        better = better and fit.result(u).residual < ideal.residual
         if better:
             break
     # A saturated pixel had at least so much light, which the ideal screen alone may not explain.
     if not better and ideal.saturated <= SCREEN_FIT.saturated:
         return ideal
-    if ideal.saturated < SCREEN_FIT.no_curve:
-        u = fit.explain(u, curve)
+    if ideal.saturated < SCREEN_FIT.no_display:
+        u = fit.explain(u, fit.curved_file and ideal.saturated < SCREEN_FIT.no_curve)
     return replace(fit.result(u), ideal_residual=ideal.residual)
 
 
@@ -109,7 +112,7 @@ def fit_screen(
 # black and mixing (off the diagonal, row by row), and the tone curve's logs: nought if absent.
 _SHIFT, _TILT, _GAMMA, _GAIN, _BLUR, _COLOUR, _FALLOFF, _BLACK, _MIXING, _CURVE = (
     slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), 12, 13, 14, 15, slice(16, 22),
-    slice(22, 22 + len(TONE_CURVE.knots)),
+    slice(22, 22 + len(KNOTS)),
 )  # fmt: skip
 _COUNT = _CURVE.stop
 _DEVICE = slice(_FALLOFF, _MIXING.stop)
@@ -171,6 +174,8 @@ class _Fit:
         self.free = np.zeros(_COUNT, bool)
         self.free[_GAIN], self.free[_BLUR] = True, True
         self.free[_COLOUR] = self.coded = photo.clip_level is not None
+        self.curved_file = self.coded and not photo.linear
+        self.asked, self.undone = False, photo.curve_deviation
         ball = image.ball
         self.step = step = max(1, round(ball.radius / SCREEN_FIT.finest))
         self.radius = ball.radius / step
@@ -206,6 +211,8 @@ class _Fit:
         self.prior_mean[_GAMMA] = np.log(device.gamma)
         self.prior_mean[[_FALLOFF, _BLACK]] = device.falloff, device.black
         mixing = np.asarray(device.mixing)
+        if photo.matrix is not None:  # what is red in Rec. 709 has some green in wider primaries
+            mixing = np.maximum(np.linalg.inv(photo.matrix) @ mixing, 0)
         mixing = mixing / mixing.sum(1, keepdims=True)  # the rest is the gain's
         self.prior_mean[_MIXING] = [mixing[pair] for pair in _PAIRS]
         self.prior_mean[_BLUR] = math.log(SCREEN_FIT.expected_blur)
@@ -217,7 +224,7 @@ class _Fit:
         deviations[[_FALLOFF, _BLACK]] = DISPLAY.falloff_deviation, DISPLAY.black_deviation
         deviations[_MIXING] = DISPLAY.mixing_deviation
         np.fill_diagonal(self.prior, 1 / deviations**2)
-        self.prior[_CURVE, _CURVE] = curve_precision()
+        self.prior_mean[_CURVE], self.prior[_CURVE, _CURVE] = likely_curves()
         self.set_gamma_prior(SCREEN_FIT.gamma_deviation)
         self.focus(0.0)
 
@@ -371,6 +378,7 @@ class _Fit:
     def start(self) -> Array:
         """The nominal pose, a straight curve and the gain that fits them best."""
         u = self.prior_mean.copy()
+        u[_CURVE] = 0  # straight until the errors ask for a curve
         seen = self.look(u)[0]
         inside = seen[..., -1] > SCREEN_FIT.inside
         if inside.sum() < SCREEN_FIT.least_inside:
@@ -505,9 +513,14 @@ class _Fit:
             return math.inf
         seen = self.look(u)[0]
         r = self.errors(u, seen)[self.use]
-        off, robust = u - self.prior_mean, SCREEN_FIT.robust
+        robust = SCREEN_FIT.robust
         loss = robust**2 / 2 * np.log1p((r / robust) ** 2).sum()
-        return float(loss + off @ self.prior @ off / 2)
+        return float(loss) + self.unlikely(u)
+
+    def unlikely(self, u: Array) -> float:
+        """The cost under the priors of what is fitted."""
+        off = np.where(self.free, u - self.prior_mean, 0)
+        return float(off @ self.prior @ off / 2)
 
     def normal_equations(self, u: Array) -> tuple[Array, Array]:
         """Gauss–Newton's matrix and right side for the free unknowns, with Cauchy's weights."""
@@ -527,9 +540,8 @@ class _Fit:
             for k, (i, j) in enumerate(_PAIRS):
                 by[_MIXING.start + k, ..., i] = gain[i] * (light[..., j] - light[..., i])
         if self.free[_CURVE].any():
-            _, steep = self.curved(u, model)
-            shares = curve_shares(model * self.reflectance)
-            by[_CURVE] = np.moveaxis(shares, -1, 0) * (model / steep)
+            curved, _ = self.curved(u, model)
+            by[_CURVE] = -np.moveaxis(curve_shares(curved * self.reflectance), -1, 0) * model
         by = self.code(u, model, by[self.free])
         if self.coded:
             step = SCREEN_FIT.difference
@@ -552,9 +564,10 @@ class _Fit:
         return float(np.sqrt(((weight * error**2).sum(0) / weight.sum(0)).mean()))
 
     def explain(self, u: Array, curve: bool) -> Array:
-        """The fit from ``u`` on with those of the display's other properties, and of the file's
-        tone curve, that the errors ask for, one after the other."""
-        blocks = [_DEVICE] + [_CURVE] * (curve and self.coded)
+        """The fit from ``u`` on with those of the display's other properties, and with ``curve`` of
+        the file's tone curve, that the errors ask for, one after the other."""
+        blocks = [_DEVICE] + [_CURVE] * curve
+        self.asked = curve
         while blocks:
             tests = [self.score(u, block) for block in blocks]
             block = blocks.pop(int(np.argmax(tests)))
@@ -596,11 +609,12 @@ class _Fit:
 
     def score(self, u: Array, block: slice) -> float:
         """By how much the cost may fall with a block of unknowns, by its slope and curvature."""
-        was = self.free.copy()
+        was, likely = self.free.copy(), self.unlikely(u)
         self.free[block] = True
         matrix, right = self.normal_equations(u)
+        lost = self.unlikely(u) - likely
         self.free = was
-        return float(right @ np.linalg.solve(matrix, right)) / 2
+        return float(right @ np.linalg.solve(matrix, right)) / 2 - lost
 
     def result(self, u: Array) -> Screen:
         """What the fit says."""
@@ -632,12 +646,12 @@ class _Fit:
 
     def covariance(self, u: Array) -> Array:
         """That of all unknowns, nought for those that are known. The display's curve counts as
-        unknown even where it could not be fitted, and so does that of an 8-bit file."""
+        unknown even where it could not be fitted, and so does that of a file that may have one."""
         was = self.free.copy()
         if self.free[0] or self.coded:
             if self.coded or not self.free[_GAMMA].any():
                 self.set_gamma_prior(DISPLAY.gamma_deviation)
-            self.free[_GAMMA], self.free[_CURVE] = True, self.coded
+            self.free[_GAMMA], self.free[_CURVE] = True, self.curved_file
         out = np.zeros((_COUNT, _COUNT))
         out[np.ix_(self.free, self.free)] = np.linalg.inv(self.normal_equations(u)[0])
         self.free = was
@@ -653,5 +667,10 @@ class _Fit:
         by[_GAMMA] = (shown * log).mean((0, 1)) / shown.mean((0, 1)) / 3
         # Of the light over the sample's, which is so much darker than white.
         sample = DISPLAY.sample * np.exp(u[_GAIN]).mean(keepdims=True) * self.reflectance.mean()
-        by[_CURVE] = curve_shares(sample)[0]
-        return float(np.sqrt(by @ covariance @ by)) * SCREEN_FIT.correlated
+        by[_CURVE] = -curve_shares(sample)[0]
+        variance = by @ covariance @ by
+        fitted = float(np.sqrt(variance)) * SCREEN_FIT.correlated
+        # Straight, or as cameras' curves are: that could not be asked where much is saturated.
+        unasked = self.curved_file and not self.asked
+        curve = float(by[_CURVE] @ self.prior_mean[_CURVE]) if unasked else 0.0
+        return math.hypot(fitted, curve, self.undone)

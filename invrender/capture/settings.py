@@ -194,7 +194,8 @@ class SquareFit:
     found_tilt: float = 0.3  # degrees, expected error of the tilt by the square; by hand
     unseen_tilt: float = 2.0  # degrees, expected tilt where no square is seen; by hand
     slope_step: float = 0.05  # deviations, of the finite differences; by hand
-    outward: tuple[int, int, int] = (-24, 49, 9)  # half pixels: search for the border; by hand
+    # Pixels outwards, of the search for the border: from, to, and where it may lie at most.
+    outward: tuple[float, float, float] = (-12.0, 24.5, 9.0)  # by hand
     behind: int = 7  # half pixels, the change's peak behind its first sight; by hand
     table_change: float = 2.5  # of the table's greatest twentieth, at the border; by hand
     table_quantile: float = 0.95  # by hand
@@ -206,6 +207,8 @@ class SquareFit:
     tenth: float = 0.9  # quantile; by hand
     least_power: tuple[float, float, float] = (1e-3, 1e-4, 1e-9)  # on, beside, whole; by hand
     even: tuple[float, float] = (4.0, 1e-6)  # of the median change, absolute; by hand
+    beside: float = 8.0  # pixels, beside a line, between which the tone must change; by hand
+    left_out: float = 100.0  # times the deviations, of a side that does not fit; by hand
 
 
 @dataclass(frozen=True)
@@ -377,7 +380,10 @@ class ScreenFit:
     poor: float = 0.01  # residual from which the nominal screen is in doubt; by hand
     better: float = 50.0  # half a chi-squared, by which another pose must be likelier; by hand
     saturated: float = 0.01  # share of saturated pixels that counts; by hand
-    no_curve: float = 0.2  # share from which gain and gamma cannot be told apart; by hand
+    # Shares from which a tone curve cannot be told, so that the display's curve is taken as usual;
+    # and from which nothing of the display can but gain and pose; by hand.
+    no_curve: float = 0.2
+    no_display: float = 0.6
     # Pixels of blur through which the screen is looked for, and the share of the cost that a step
     # must gain. Through the greatest blur the room behind the screen is vague: a few steps, and it
     # is estimated anew.
@@ -434,18 +440,12 @@ class Display:
 class ToneCurve:
     """The tone curve of an 8-bit file: `invrender.capture.response`."""
 
-    knots: tuple[float, ...] = (0.004, 0.015, 0.05, 0.14, 0.3, 0.55, 0.85, 1.3, 2.5)  # by hand
-    fixed: int = 3  # the knot that stays as it is: about middle grey
-    white: int = 6  # the knot nearest to white
-    # Of that knot's logarithm, at most: a camera's curve flattens there. Of eight straight files
-    # the fit's was -0.09 at least, of twelve curved ones -0.15 at most.
-    shoulder: float = -0.12
+    # Of the logarithm of light over value at white, at least: a camera's curve flattens there.
+    shoulder: float = 0.12
     # By how much a slope between grey and white may exceed the one before it; a false curve's did
     # by 0.95. By hand.
     steeper: float = 0.4
-    fixed_deviation: float = 1e-3  # of its logarithm; by hand
-    slope_deviation: float = 0.5  # of the curve's slope about 1; by hand
-    bend_deviation: float = 0.4  # of the slope's change from knot to knot; by hand
+    fixed_deviation: float = 1e-3  # of the fixed knot's logarithm; by hand
     darkest: float = 1e-6  # linear; by hand
     least_slope: float = 0.1  # of the whole curve, in logarithms, that can be undone; by hand
     parts: int = 16  # of a photo, one after the other, to save memory; by hand

@@ -19,7 +19,7 @@ import numpy as np
 from scipy import ndimage
 
 from invrender.files.images import Photo
-from invrender.files.tone_curves import curve_prior
+from invrender.files.tone_curves import FIXED, KNOTS, curve_prior
 from invrender.sampling import knot_shares
 from invrender.types import Array, InputError, Mask, Notice
 
@@ -36,9 +36,6 @@ class BracketSettings:
     exif_error: float = 0.02  # standard deviation of the logarithm of EXIF's exposure
     unknown_exposure: float = 3.0  # the same, where EXIF is silent
     samples: int = 20_000  # pixels, for the tone curve
-    # Linear values; the curve's logarithms are linear between, and nought at the fixed one.
-    knots: tuple[float, ...] = (0.003, 0.01, 0.03, 0.08, 0.2, 0.4, 0.65, 0.95)
-    fixed: int = 3
     curved: float = 8.0  # by how much a straight curve's squared errors must be larger
     bin: float = 0.15  # of the logarithm, of the pixels whose median is taken
     least_bin: int = 30  # pixels in one
@@ -47,6 +44,8 @@ class BracketSettings:
     limit: float = 0.7  # of the logarithm, above the darkest usable value
     certain: float = 1e-3  # deviation of what is fixed
     usable: tuple[float, float] = (0.01, 0.9)  # linear values, of white, that say something
+    # What a photo is exposed for: dark light in the longest, bright light in the shortest one.
+    exposed: tuple[float, float] = (0.2, 0.65)
     fading: float = 0.7  # of white, from which a value counts less
     beside: int = 7  # pixels a side, around a value, that count with it
     least_common: int = 500  # pixels that two photos must both show well
@@ -68,6 +67,8 @@ def merge_bracket(photos: Sequence[Photo], names: Sequence[str]) -> Photo:
     """
     if len({p.image.shape for p in photos}) > 1:
         raise InputError(f"{', '.join(names)} differ in size: a bracket's photos must not")
+    if any(not np.array_equal(p.matrix, photos[0].matrix) for p in photos):  # type: ignore[arg-type]
+        photos = [p.in_rec709() for p in photos]
     brightness = [float(np.median(p.image)) for p in photos]
     told = [p.exposure for p in photos]
     known = all(t is not None for t in told) and len(set(told)) > 1
@@ -82,14 +83,14 @@ def merge_bracket(photos: Sequence[Photo], names: Sequence[str]) -> Photo:
     usable = [_usable(image) for image in images]
     _check_sharpness(images, usable, names)
     exposures = [p.exposure for p in photos] if known else None
-    curve, logs, off = _tone_curve(images, usable, exposures)
+    curve, logs, deviation, off = _tone_curve(images, usable, exposures)
     if logs[-1] - logs[0] < BRACKET.same_exposure:
         raise InputError(
             f"{', '.join(names)} have the same exposure: a bracket needs another one, twice as "
             "long or more"
         )
     merged = _merge(images, curve, logs)
-    top = float(np.exp(np.interp(0.0, np.log(BRACKET.knots), curve)))
+    top = float(np.exp(np.interp(0.0, np.log(KNOTS), curve)))
     shares = ", ".join(f"{math.exp(x):.3g}" for x in logs)
     note = Notice("photo-bracket", f"{', '.join(names)} were merged; their exposures are {shares}")
     warnings = {w.code: w for p in photos for w in p.warnings}
@@ -107,7 +108,8 @@ def merge_bracket(photos: Sequence[Photo], names: Sequence[str]) -> Photo:
         warnings["bracket-unsteady"] = Notice("bracket-unsteady", text)
     return replace(
         photos[0], image=(merged * white).astype(np.float32), exposure=None,
-        clip_level=None if photos[0].clip_level is None else white * top,
+        clip_level=None if photos[0].clip_level is None else white * top, linear=True,
+        curve_deviation=deviation,
         notes=(*photos[0].notes, note), warnings=tuple(warnings.values()),
     )  # fmt: skip
 
@@ -179,10 +181,11 @@ def _check_sharpness(images: Sequence[Array], usable: Sequence[Mask], names: Seq
 
 def _tone_curve(
     images: Sequence[Array], usable: Sequence[Mask], exposures: Sequence[float | None] | None
-) -> tuple[Array, Array, float]:
-    """Logarithms of light over value at the knots; of the exposures over the first one; and the
+) -> tuple[Array, Array, float, float]:
+    """Logarithms of light over value at the knots; of the exposures over the first one; the
+    deviation of the logarithm of bright light in that over dark light in the last one; and the
     median deviation that is left."""
-    knots = np.log(BRACKET.knots)
+    knots = np.log(KNOTS)
     count, n = len(knots), len(images)
     pairs = []
     for k in range(1, n):
@@ -199,13 +202,13 @@ def _tone_curve(
         pairs.append((k, shorter, longer))
 
     # The prior as rows of a triangle, whose square is the inverse covariance.
-    mean, covariance = curve_prior(np.asarray(BRACKET.knots), BRACKET.fixed)
+    mean, covariance = curve_prior(np.asarray(KNOTS), FIXED)
     triangle = np.linalg.cholesky(np.linalg.inv(covariance)).T
     rows = [np.pad(triangle, ((0, 0), (0, n)))]
     right = [triangle @ mean]
     known = BRACKET.exif_error if exposures else BRACKET.unknown_exposure
     for place, deviation, value in [
-        (BRACKET.fixed, BRACKET.certain, 0.0),
+        (FIXED, BRACKET.certain, 0.0),
         (count, BRACKET.certain, 0.0),
         *(
             (
@@ -242,15 +245,23 @@ def _tone_curve(
     straight[count:] = np.linalg.lstsq(matrix[:, count:], values)[0]
     worse = np.square(matrix @ straight - values).sum()
     worse -= np.square(matrix @ solution - values).sum()
+    system = np.concatenate(rows)
+    span = np.zeros(count + n)
+    span[-1] = 1
     if worse < BRACKET.curved:
-        solution = straight
+        solution, system = straight, system[:, count:]
+    else:
+        low, high = np.log(BRACKET.exposed)
+        span[:count] = knot_shares(high, knots) - knot_shares(low, knots)
+    span = span[-system.shape[1] :]
+    deviation = float(np.sqrt(span @ np.linalg.pinv(system.T @ system) @ span))
     curve, logs = solution[:count], solution[count:]
 
     def light(log: Array) -> Array:
         return np.asarray(log + np.interp(log, knots, curve))
 
     off = [np.median(np.abs(light(b) - light(a) - logs[k] + logs[k - 1])) for k, a, b in pairs]
-    return curve, logs, float(max(off))
+    return curve, logs, deviation, float(max(off))
 
 
 def _merge(images: Sequence[Array], curve: Array, logs: Array) -> Array:
@@ -260,7 +271,7 @@ def _merge(images: Sequence[Array], curve: Array, logs: Array) -> Array:
     weights = np.zeros(images[0].shape)
     for k, (image, log) in enumerate(zip(images, logs, strict=True)):
         value = np.maximum(np.nan_to_num(image), 1e-6)
-        light = value * np.exp(np.interp(np.log(value), np.log(BRACKET.knots), curve) - log)
+        light = value * np.exp(np.interp(np.log(value), np.log(KNOTS), curve) - log)
         full = np.nan_to_num(image, nan=1.0).max(-1)
         # Beside what is saturated, a JPEG's colours and the lens's glow are wrong too.
         full = ndimage.maximum_filter(full, BRACKET.beside)[..., None]

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -35,10 +35,14 @@ SQUARE = 0.01  # by which a pixel's width may differ from its height
 class Photo:
     """A photograph, upright: ``image`` (H, W, 3) linear RGB float32, not negative.
 
-    ``clip_level`` is the value at which a channel is saturated, None for HDR files. ``fov`` is the
-    horizontal field of view in degrees and ``exposure`` the relative exposure t·ISO/(100·N²), in
-    seconds, both None where the file does not say. ``notes`` tell what was done to the file's
-    values to get here, ``warnings`` what is doubtful about them.
+    ``matrix`` (3, 3) makes Rec. 709 of it; None where it is that. An integer file keeps its own
+    primaries, in which its camera's tone curve and saturation are simple, until `in_rec709`.
+    ``linear``: no tone curve of a camera is in it, or none any more; an HDR file has none anyway.
+    ``curve_deviation``: what undoing it leaves, a standard deviation of the logarithm of bright
+    over dark light. ``clip_level`` is the value at which a channel is saturated, None for HDR
+    files. ``fov`` is the horizontal field of view in degrees and ``exposure`` the relative exposure
+    t·ISO/(100·N²), in seconds, both None where the file does not say. ``notes`` tell what was done
+    to the file's values to get here, ``warnings`` what is doubtful about them.
     """
 
     image: Array
@@ -47,6 +51,9 @@ class Photo:
     exposure: float | None = None
     notes: tuple[Notice, ...] = ()
     warnings: tuple[Notice, ...] = ()
+    matrix: Array | None = None
+    linear: bool = False
+    curve_deviation: float = 0.0
 
     @property
     def height(self) -> int:
@@ -63,6 +70,19 @@ class Photo:
             return np.zeros(self.image.shape[:2], bool)
         r, g, b = (self.image[..., k] >= self.clip_level for k in range(3))
         return np.asarray(r | g | b)
+
+    def in_rec709(self) -> Photo:
+        """The photo with Rec. 709 primaries; what is saturated stays so, and nothing else is."""
+        if self.matrix is None:
+            return self
+        image = np.maximum(self.image @ self.matrix.T.astype(np.float32), 0)
+        level = self.clip_level
+        if level is not None:
+            top = level * float(np.maximum(self.matrix, 0).sum(1).max())
+            full = self.clipped
+            image[full] = np.maximum(image[full], top * (self.image[full] >= level))
+            level = top
+        return replace(self, image=image, clip_level=level, matrix=None)
 
 
 def read_image(path: Path, *, linear: bool = False) -> Array:
@@ -88,7 +108,8 @@ def read_alpha(path: Path) -> Array:
 
 
 def read_photo(path: Path) -> Photo:
-    """Read a photograph as `read_image` does, with what its file says about lens and exposure.
+    """Read a photograph as `read_image` does, with what its file says about lens and exposure; but
+    an integer file's colours keep their primaries (`Photo.matrix`).
 
     One of more than `WHOLE_PIXELS` is averaged down, light by light. Raises `InputError` as
     `read_image` does, and for a photo with pixels that are missing, transparent or not square.
@@ -103,14 +124,20 @@ def read_photo(path: Path) -> Photo:
     _check_photo(path, raster)
     height, width = raster.data.shape[:2]
     reduction = next(k for k in range(1, 1 << 16) if height * width <= WHOLE_PIXELS * k * k)
+    clip, matrix = clip_level(raster), None
+    linear = raster.encoding.curve is None and raster.encoding.convert is None
+    if clip is not None and raster.encoding.convert is None:
+        matrix = raster.encoding.matrix
+        raster.encoding = replace(raster.encoding, matrix=None)
     image = decode(raster, reduction=reduction)
     _check_finite(path, raster, image)
-    clip = clip_level(raster)
     if clip is None or raster.encoding.matrix is not None or raster.encoding.convert is not None:
         np.maximum(image, 0, out=image)
     _tell(raster, image.shape, reduction)
     fov, exposure = lens(raster, *_stored_size(raster))
-    return Photo(image, clip, fov, exposure, tuple(raster.notes), tuple(raster.warnings))
+    return Photo(
+        image, clip, fov, exposure, tuple(raster.notes), tuple(raster.warnings), matrix, linear
+    )
 
 
 def _stored_size(raster: Raster) -> tuple[int, int]:

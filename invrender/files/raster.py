@@ -255,18 +255,14 @@ def _to_light(
 
 
 def clip_level(raster: Raster) -> float | None:
-    """The light at which a channel is saturated; None for float images."""
+    """The light at which a channel is saturated, in the file's primaries; None for float images."""
     if raster.data.dtype.kind != "u":
         return None
     e = raster.encoding
     grey = np.full((1, 3), raster.saturated)
     if e.convert is not None:
         return float(srgb_to_linear(grey).min())
-    level = float(np.min(grey if e.curve is None else e.curve(grey)))
-    if e.matrix is not None:
-        # The other channels, at white, pull a saturated one down by what the matrix takes off.
-        level -= (float(np.diag(e.matrix).max()) - 1) * (1 - level) if level < 1 else 0
-    return level
+    return float(np.min(grey if e.curve is None else e.curve(grey)))
 
 
 def aspect(x: Any, y: Any) -> float:

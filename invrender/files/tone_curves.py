@@ -23,6 +23,10 @@ EXPONENTS = (0.9, 1.0, 1.1)
 ACES_EXPOSURES = (0.5, 1.0, 2.0)  # light at which that curve is cut off
 # Logarithms: by how much a camera's curve differs from all members, independently at each knot.
 OTHERWISE = 0.03
+# Values of a file, of white, between which a curve's logarithm is linear; chosen by hand. At the
+# fixed one light and value are equal.
+KNOTS = (0.003, 0.01, 0.03, 0.08, 0.2, 0.4, 0.65, 0.95)
+FIXED = 4
 LEAST_LIGHT, COUNT = 1e-3, 400  # light at which a curve starts, white being 1; values of its table
 
 

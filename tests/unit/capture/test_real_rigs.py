@@ -9,6 +9,7 @@ from synthetic_photo import blocks, grey_table, photograph, textured_table
 from invrender.capture.ball import find_ball, find_fov
 from invrender.capture.lights import find_lights, level_table
 from invrender.capture.mirror import make_ball
+from invrender.colour import PRIMARIES, to_rec709
 from invrender.files.capture import Capture
 from invrender.files.images import Photo
 from invrender.rig import Rig
@@ -55,6 +56,22 @@ def test_the_lights_of_a_steel_ball_are_as_bright_as_they_are(steel):
     assert [n.code for n in found.notices] == ["ball-reflectance-measured"]
     assert found.lights.fit["ball_reflectance"] == pytest.approx(0.547, rel=0.04)
     assert found.lights.fit["ball_reflectance_deviation"] > 0
+
+
+def test_a_photo_in_wider_primaries_gives_the_same_lights():
+    """A phone's JPEG has Display P3, in which the pattern's colours are no longer pure."""
+    matrix = to_rec709(PRIMARIES["p3d65"])
+    scene = photograph(STEEL, *SIZE, table=grey_table, ball=SHIFT).astype(np.float32)
+    wide = (scene @ np.linalg.inv(matrix).T).astype(np.float32)
+    level = 2 * float(scene.max())
+    photo = Photo(wide, level, matrix=matrix)
+    found = find_lights(Capture(photo, RIG, PATTERN, unknown=UNKNOWN))
+    np.testing.assert_allclose(found.lights.gain, GAIN, rtol=0.04)
+    np.testing.assert_allclose(found.lights.device.mixing, np.eye(3), atol=0.02)
+    np.testing.assert_allclose(found.capture.photo.image, scene, atol=1e-3)
+    bright = replace(photo, clip_level=float(np.quantile(wide, 0.999)))
+    assert bright.clipped.any()
+    np.testing.assert_array_equal(bright.in_rec709().clipped, bright.clipped)
 
 
 def test_a_stated_reflectance_is_used_and_doubted(steel):

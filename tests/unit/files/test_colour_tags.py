@@ -22,7 +22,7 @@ EIGHT, SIXTEEN = 0.5 / 255 * 2.4, 0.5 / 65535 * 2.4
 
 
 def close(path, tolerance, scene=SCENE):
-    photo = read_photo(path)
+    photo = read_photo(path).in_rec709()
     np.testing.assert_allclose(photo.image, scene, atol=tolerance)
     return photo
 
@@ -30,7 +30,7 @@ def close(path, tolerance, scene=SCENE):
 def close_on_average(path, scene=SCENE, tolerance=2e-3):
     """What YCbCr rounds off is no bias: mean colours agree, of which P3 taken for sRGB, or one
     curve for another, is off by 0.01 and more."""
-    photo = read_photo(path)
+    photo = read_photo(path).in_rec709()
     np.testing.assert_allclose(photo.image.mean((0, 1)), scene.mean((0, 1)), atol=tolerance)
     np.testing.assert_allclose(photo.image, scene, atol=0.035)
     return photo
@@ -646,5 +646,5 @@ def test_a_cropped_photo_has_no_field_of_view(tmp_path):
     path.write_bytes(made.jpeg(made.codes(SCENE), exif=exif))  # 64 × 48, scaled down
     assert read_photo(path).fov == pytest.approx(71.59, abs=0.01)
     path.write_bytes(made.jpeg(made.codes(SCENE[:, :40]), exif=exif))
-    photo = read_photo(path)
+    photo = read_photo(path).in_rec709()
     assert photo.fov is None and codes_of(photo) == ([], ["photo-cropped"])
