@@ -43,6 +43,7 @@ def main() -> None:
     p.add_argument("--data", type=Path, required=True)
     p.add_argument("--valid", type=Path, required=True)
     p.add_argument("--out", type=Path, required=True)
+    p.add_argument("--methods", nargs="+", choices=tuple(METHODS), default=tuple(METHODS))
     p.add_argument("--minutes", type=float, default=1.0, help="of processor time, each")
     args = p.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
@@ -50,7 +51,7 @@ def main() -> None:
     rows = list(csv.DictReader(table.open())) if table.exists() else []
     done = {(r["method"], float(r["rate"])) for r in rows}
     for rate in CANDIDATES:
-        for method in METHODS:
+        for method in args.methods:
             if (method, rate) in done:
                 continue
             out = args.out / f"{method}-{rate:g}"
