@@ -6,13 +6,15 @@ turns, and ratios are medians of the rounds' (ours over theirs). Captures are of
 and room at one size of photo (`benchmarks.common.captures`), whose maps are asked for at all sizes.
 Error is that of the average map: shrunk to 256², against the truth at 256²; and, above 256², of the
 band of details that 256² do not hold, over that of having none. A first run has an empty cache of
-kernels.
+kernels. From `ONCE` pixels a side there is one round. A batch is of copies of one capture;
+``inspect`` looks at a JPEG of 48 megapixels.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import shutil
 import statistics
 import subprocess
 import sys
@@ -22,19 +24,28 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from benchmarks.common.captures import PHOTOGRAPHS, arguments, make_captures
+from benchmarks.common.photos import make_shot
 from benchmarks.common.plot import plot_error_over_time
 from benchmarks.common.results import Bar, bar, table, write_results
+from invrender.colour import linear_to_srgb
 from invrender.files.capture import load_capture
 from invrender.files.maps import read_maps
+from invrender.files.rig_toml import write_rig
+from invrender.files.write import write_exr
 from invrender.maps import Maps, map_errors, resize_maps
 from invrender.types import Array
 
 HERE = Path(__file__).parents[1]
 SMALL = 256  # pixels a side at which maps of all sizes are compared
 SIZES = (256, 512, 1024, 2048, 4096)
+ONCE = 2048  # pixels a side from which there is one round
 PHOTO = 3840  # pixels wide
+BATCH = 20  # captures
+HUGE = 8000  # pixels wide, of 48 megapixels
+SEED = 2994  # of the large photo
 INVRENDER = ("-m", "invrender")
 EXAMPLE = (*INVRENDER, "refine", "example", "-o", "OUT")
 COMMANDS = {
@@ -45,8 +56,8 @@ COMMANDS = {
 FIRST = "refine example, first run"
 # Seconds over those of the other checkout, and peak GB.
 TIME_BARS = {FIRST: 0.6, "refine example": 0.35, "invrender --help": 0.3,
-             "1024²": 0.3, "2048²": 0.25, "4096²": 0.15}  # fmt: skip
-MEMORY_BARS = {"1024²": 1.2, "2048²": 2.0, "4096²": 4.0}
+             "1024²": 0.3, "2048²": 0.25, "4096²": 0.15, "batch": 0.5, "inspect": 0.5}  # fmt: skip
+MEMORY_BARS = {"1024²": 1.2, "2048²": 2.0, "4096²": 4.0, "inspect": 1.0}
 
 QUANTITIES = ("seconds", "processor seconds", "GB")
 Cost = dict[str, float]  # of each of these
@@ -66,12 +77,12 @@ os._exit(os.waitstatus_to_exitcode(status) & 255)
 
 
 def run(checkout: Path, command: Sequence[str], out: Path, home: Path | None = None) -> Cost:
-    """Run ``python COMMAND`` with a checkout's code, OUT in it being a folder; what it took.
+    """Run ``python COMMAND`` with a checkout's code, OUT in it being a name; what it took.
 
     home: another home folder, where Dr.Jit finds no compiled kernels. Raises `RuntimeError` with
     the process's last words where it fails.
     """
-    words = [sys.executable, *(str(out) if word == "OUT" else word for word in command)]
+    words = [sys.executable, *(word.replace("OUT", str(out)) for word in command)]
     env = {**os.environ, "PYTHONPATH": str(checkout), **({"HOME": str(home)} if home else {})}
     with tempfile.TemporaryDirectory() as name:
         took = Path(name) / "took"
@@ -114,6 +125,17 @@ def errors(out: Path, truth: Maps) -> dict[str, float]:
     return found
 
 
+def huge_photo(folder: Path, width: int) -> Path:
+    """A capture whose photo is a JPEG of so many pixels."""
+    shot = make_shot(SEED, kind="jpeg", width=width)
+    folder.mkdir(parents=True, exist_ok=True)
+    encoded = linear_to_srgb(np.clip(shot.photo.image, 0, 1)) * 255
+    Image.fromarray(np.round(encoded).astype(np.uint8)).save(folder / "photo.jpg", quality=90)
+    write_exr(folder / "pattern.exr", shot.pattern)
+    write_rig(folder / "rig.toml", shot.nominal, "pattern.exr")
+    return folder
+
+
 def parser() -> argparse.ArgumentParser:
     p = arguments(__doc__, "one small procedural capture at 128² and 512²", 1)
     p.add_argument("--against", type=Path, help="a checkout of the commit to compare with")
@@ -153,10 +175,16 @@ def main(args: argparse.Namespace) -> None:
                 truth = load_capture(folder).truth
                 assert truth is not None
                 words = (*INVRENDER, "refine", str(folder.resolve()), "-o", "OUT", "--size", str(n))
-                turns(what, words, rounds)
+                turns(what, words, rounds if n < ONCE else 1)
                 for c in checkouts:
                     error = errors(out / f"{c} {what}", truth)
                     found.setdefault(what, {}).setdefault(c, []).append(error)
+        batch = [out / f"capture {k:02}" for k in range(3 if args.quick else BATCH)]
+        for copy in batch:
+            shutil.copytree(folders[0], copy)
+        turns("batch", (*INVRENDER, "refine", *map(str, batch), "-o", "OUT"), 1)
+        huge = huge_photo(args.out / "huge", 1200 if args.quick else HUGE)
+        turns("inspect", (*INVRENDER, "inspect", str(huge.resolve()), "-o", "OUT"), rounds)
     report(args.out, costs, found)
 
 
