@@ -49,7 +49,7 @@ KNOWN = (0.0, 0.0)  # doubt of lights that are known
 class Settings:
     """All chosen by hand on 9 simulated captures, of which 5 others told whether it carries over
     (docs/research-log/2026-11-29-what-materials-share.md). Pairs: a constant, and a share of the
-    albedo."""
+    albedo or of ρ."""
 
     side: int = 64  # pixels a side that are compared
     parts: int = 16  # a side, whose means are compared
@@ -66,12 +66,13 @@ class Settings:
     # what a material is off by
     shared_diffuse: tuple[float, float] = (0.01, 0.1)
     shared_specular: tuple[float, float] = (0.002, 0.2)
-    shared_roughness: float = 0.05
+    shared_roughness: tuple[float, float] = (0.01, 0.03)  # of a dielectric
+    shared_metal_roughness: float = 0.05  # of a metal, whose lobe is all that the photo shows
     alike: tuple[float, float] = (0.9, 0.3)  # correlation of materials: of one kind; of two
     # what a part is off by
     part_diffuse: tuple[float, float] = (0.013, 0.1)
     part_specular: tuple[float, float] = (0.002, 0.02)
-    part_roughness: float = 0.01
+    part_roughness: tuple[float, float] = (0.01, 0.0)
     part_slope: tuple[float, float] = (0.005, 0.15)  # at least; of a pixel's expected error
     correlation: tuple[float, float] = (0.9, 0.95)  # of the channels of k_d, and of k_s
     relief: float = 1.0  # deviation of the share of the unresolved slopes that widens the lobe
@@ -171,19 +172,27 @@ def plain_dielectric(theta: Array, s: Settings = SHARED_SETTINGS) -> Array:
 
 def shared_sigma(theta: Array, s: Settings = SHARED_SETTINGS) -> Array:
     """Deviations (H, W, 7) of what a material is off by."""
-    return _sigma(theta, s.shared_diffuse, s.shared_specular, s.shared_roughness, s)
+    sigma = _sigma(theta, s.shared_diffuse, s.shared_specular, s.shared_roughness, s)
+    metal = _metal(theta[..., S].mean(-1), s)
+    sigma[..., R] += metal * (s.shared_metal_roughness - sigma[..., R])
+    return sigma
+
+
+def _metal(f0: Array, s: Settings) -> Array:
+    """By how much an f0 is a metal's."""
+    none, all_ = s.metal_f0
+    return np.clip((f0 - none) / (all_ - none), 0, 1)
 
 
 def _sigma(
-    theta: Array, diffuse: tuple[float, float], specular: tuple[float, float], roughness: float,
-    s: Settings,
+    theta: Array, diffuse: tuple[float, float], specular: tuple[float, float],
+    roughness: tuple[float, float], s: Settings,
 ) -> Array:  # fmt: skip
-    none, all_ = s.metal_f0
     k_s = theta[..., S]
     sigma = np.empty((*theta.shape[:-1], UNKNOWNS), np.float32)
     sigma[..., D] = diffuse[0] + diffuse[1] * theta[..., D]
-    sigma[..., S] = specular[0] + specular[1] * k_s * np.clip((k_s - none) / (all_ - none), 0, 1)
-    sigma[..., R] = roughness
+    sigma[..., S] = specular[0] + specular[1] * k_s * _metal(k_s, s)
+    sigma[..., R] = roughness[0] + roughness[1] * theta[..., R]
     return sigma
 
 
@@ -269,11 +278,12 @@ class _Problem:
         unresolved = (total[..., N] ** 2 + self.theta[..., N] ** 2).mean(-1)
         widened = (rho**4 + 2 * unresolved) ** 0.25 - rho
         size = np.maximum(self.weight.sum((0, 1)), 1e-9)
-        widened = s.relief * np.einsum("hw,hwk->k", widened, self.weight) / size
+        self.rough, widened = (
+            np.einsum("hw,hwk->k", x, self.weight) / size for x in (self.shared[..., R], widened)
+        )  # deviations of each material's roughness
         self.apparent = np.ones((len(centres), UNKNOWNS))  # deviation of z as it is seen
-        self.apparent[:, R] = np.hypot(1, widened / s.shared_roughness)
-        none, all_ = s.metal_f0
-        metal = np.clip((self.theta[..., S].mean(-1) - none) / (all_ - none), 0, 1)
+        self.apparent[:, R] = np.hypot(1, s.relief * widened / self.rough)
+        metal = _metal(self.theta[..., S].mean(-1), s)
         self.metal = np.einsum("hw,hwk->k", metal, self.weight) / size
         height, width = self.theta.shape[:2]
         self.part = parts_of(height, width, s)
@@ -419,8 +429,8 @@ def _solve(problem: _Problem, s: Settings) -> _Solution:
         for _ in range(s.steps):
             hessian, gradient = _normal(problem, u, seen, surprise, s)
             step = np.linalg.solve(hessian, gradient)
-            rho = step[:n].reshape(-1, UNKNOWNS)[:, R] * problem.apparent[:, R]
-            step *= min(1.0, s.longest / max(float(np.abs(s.shared_roughness * rho).max()), 1e-9))
+            rho = step[:n].reshape(-1, UNKNOWNS)[:, R] * problem.apparent[:, R] * problem.rough
+            step *= min(1.0, s.longest / max(float(np.abs(rho).max()), 1e-9))
             for shorter in s.shorter:
                 trial = problem.evaluate(u + shorter * step)
                 new, unlikely = cost_of(u + shorter * step, trial)
