@@ -101,7 +101,8 @@ class Lights:
     of screen and room in the ball that are saturated, ``room_raised`` how many times brighter the
     saturated lamps were made, ``gain_by_table`` by what the ball's gain was multiplied, by the
     table's shading, ``vignetting`` the share of light that the lens loses in the photo's corners,
-    which was undone, ``hidden_lamp`` how many times brighter than the filling a part of
+    which was undone, ``border_unseen`` 1 where neither the sample's border nor a sheet shows the
+    camera's place, ``hidden_lamp`` how many times brighter than the filling a part of
     the room behind the screen was made (1: none), ``pattern_residual`` the residual before the
     screen's pose and curve were fitted, ``screen_shift`` (metres) and ``screen_tilt`` (degrees) how
     far the screen is found from its place, ``camera_tilt`` how far the camera is found to look past

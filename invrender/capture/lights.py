@@ -103,6 +103,9 @@ def find_lights(
         lights, paper = use_paper(sheet, lights, found)
         photo = without_vignetting(capture.photo, lights.fit["vignetting"])
         lights = _in_rec709(lights, photo.matrix)
+        # The rim's tilt is kept only where the square of the sample shows none.
+        unseen = sheet is None and found.camera_tilt is not None
+        lights.fit["border_unseen"] = float(unseen)
         capture = replace(capture, photo=photo.in_rec709())
     if environment is not None:
         lights = replace(lights, environment=environment)

@@ -89,18 +89,27 @@ def fit_screen(
         fit.set_gamma_prior(DISPLAY.gamma_deviation)
     if not fit.free[_GAMMA.start]:  # what is left of the screen tells little of its colour
         fit.prior[_GAIN, _GAIN] = _APART / SCREEN_FIT.white_deviation**2
-    start = u
-    for first in (0, 2):  # if the greatest blur leads astray, without it
+    start, found = u, None
+    # If the greatest blur leads astray, without it; a display that dims misleads the pose.
+    for dims, first in ((False, 0), (False, 2), (True, 0), (True, 2)):
+        if dims and not fit.free[_GAMMA.start]:
+            break
+        fit.free[_FALLOFF] = dims
         u = fit.start()
         for blurred, least in SCREEN_FIT.stages[first:]:
             u = fit.solve(u, blurred * max(1.0, fit.radius / SCREEN_FIT.stage_radius), least)
-        better = fit.cost(start) - fit.cost(u) > SCREEN_FIT.better
+        better = u[_FALLOFF] >= 0 and fit.cost(start) - fit.cost(u) > SCREEN_FIT.better
         # A screen far off has another room behind it, under which the nominal one may look worse.
-        better = better and fit.result(u).residual < ideal.residual
-        if better:
+        residual = fit.result(u).residual
+        if better and residual < (found[0] if found else ideal.residual):
+            found = residual, dims, u
+        if found and (dims or found[0] < SCREEN_FIT.good):
             break
+    if found:
+        fit.free[_FALLOFF], u = found[1:]
+        u = fit.solve(u, *SCREEN_FIT.stages[-1])
     # A saturated pixel had at least so much light, which the ideal screen alone may not explain.
-    if not better and ideal.saturated <= SCREEN_FIT.saturated:
+    if not found and ideal.saturated <= SCREEN_FIT.saturated:
         return ideal
     if ideal.saturated < SCREEN_FIT.no_display:
         u = fit.explain(u, fit.curved_file and ideal.saturated < SCREEN_FIT.no_curve)
@@ -570,7 +579,7 @@ class _Fit:
         self.asked = curve
         while blocks:
             tests = [self.score(u, block) for block in blocks]
-            block = blocks.pop(int(np.argmax(tests)))
+            block, was = blocks.pop(int(np.argmax(tests))), self.free.copy()
             if max(tests) < self.least_gain(u):
                 break
             tried = self.with_block(u, block)
@@ -578,6 +587,7 @@ class _Fit:
             no_curve = block == _CURVE and not Response(tuple(tried[_CURVE])).is_likely
             if gained < needed or no_curve:
                 self.drop(block)
+                self.free = was
                 self.prepare(u)
             else:
                 u = tried
@@ -671,6 +681,9 @@ class _Fit:
         variance = by @ covariance @ by
         fitted = float(np.sqrt(variance)) * SCREEN_FIT.correlated
         # Straight, or as cameras' curves are: that could not be asked where much is saturated.
-        unasked = self.curved_file and not self.asked
-        curve = float(by[_CURVE] @ self.prior_mean[_CURVE]) if unasked else 0.0
+        curve = 0.0
+        if self.curved_file and not self.asked:
+            white = np.exp(u[_GAIN]).mean(keepdims=True) * self.reflectance.mean()
+            span = curve_shares(white) - curve_shares(sample)
+            curve = float(span[0] @ self.prior_mean[_CURVE])
         return math.hypot(fitted, curve, self.undone)

@@ -270,6 +270,7 @@ class SheetFit:
     environment_rows: int = 32  # by hand
     room_deviation: float = 0.5  # of the room's factor about 1; by hand
     vignetting_deviation: float = 0.3  # of the light that a corner lacks; by hand
+    most_vignetting: float = 0.9  # of that; by hand
     gains_differ: float = 3.0  # deviations between the gains by paper and ball; by hand
     useful: float = (
         0.5  # deviation of its logarithm to which the gain by paper says something; by hand
@@ -378,6 +379,7 @@ class ScreenFit:
     finest: float = 100.0  # pixels; a larger ball is shrunk for the fit; by hand
     cells: int = 128  # of the pattern in the fit, a side; by hand
     poor: float = 0.01  # residual from which the nominal screen is in doubt; by hand
+    good: float = 0.02  # residual from which the display may dim to the sides; by hand
     better: float = 50.0  # half a chi-squared, by which another pose must be likelier; by hand
     saturated: float = 0.01  # share of saturated pixels that counts; by hand
     # Shares from which a tone curve cannot be told, so that the display's curve is taken as usual;

@@ -32,7 +32,7 @@ from invrender.capture.sheet_layout import (
     marker_dictionary,
 )
 from invrender.capture.table import room_irradiance, screen_irradiance
-from invrender.capture.vignetting import squared_distance
+from invrender.capture.vignetting import lens_gain, squared_distance
 from invrender.files.capture import Capture
 from invrender.files.images import Photo
 from invrender.lights import Lights
@@ -602,7 +602,8 @@ def screen_gain(found: FoundSheet, lights: Lights) -> tuple[Array, float] | None
 
     def errors(x: Array) -> Array:
         bright = screen * given * x[:3] + x[3] * room
-        off = (bright * (1 - x[4] * found.white_aside[:, None]) - seen) * weight
+        lens = lens_gain(min(x[4], SHEET_FIT.most_vignetting), found.white_aside)
+        off = (bright / lens[:, None] - seen) * weight
         white = np.log(np.maximum(given * x[:3], TINY))
         prior = (
             *((white - white.mean()) / SCREEN_FIT.white_deviation),
@@ -646,6 +647,14 @@ def use_paper(
     gain, deviation = measured
     off = float(np.mean(gain) / np.mean(lights.gain))
     fit = {**lights.fit, "paper_gain": off, "paper_gain_deviation": deviation}
+    doubt = fit.get("gain_deviation", 0.0)
+    agree = abs(math.log(off)) <= SHEET_FIT.gains_differ * math.hypot(deviation, doubt)
+    if agree and doubt > 0:  # both tell something: by their variances
+        share = doubt**2 / (doubt**2 + deviation**2)
+        ball_gain = np.asarray(lights.gain, float)
+        gain = ball_gain * (gain / ball_gain) ** share
+        lights = replace(lights, gain=gain.astype(np.float32))
+        fit["gain_deviation"] = math.sqrt(share) * deviation
     if fit.get("saturated", 0) > SCREEN_FIT.saturated and deviation < SHEET_FIT.useful:
         text = (
             f"{fit['saturated']:.0%} of the screen is saturated in the ball; its radiance was "
@@ -654,7 +663,7 @@ def use_paper(
         notices.append(Notice("gain-by-paper", text))
         fit["gain_by_paper"] = 1.0
         return replace(lights, gain=gain.astype(np.float32), fit=fit), tuple(notices)
-    if abs(math.log(off)) > SHEET_FIT.gains_differ * deviation:
+    if not agree:
         text = (
             f"the light on the capture sheet's paper is {off:.2f} times what the ball's image of "
             "the screen explains: check [ball] reflectance, and that the paper is plain and white"

@@ -37,6 +37,12 @@ def map_notices(
             f"in the ball, the screen hangs {1000 * shift:.0f} mm from where "
             "rig.toml says: check its sizes, above all the screen's height",
         )
+    if fit.get("border_unseen"):
+        note(
+            "border-unseen",
+            "the sample's border is not to be seen in the photo, so that the maps may be shifted by "
+            "some millimetres: lay it on something plain of another brightness, or use the sheet",
+        )
     if clipped.any():
         note(
             "sample-saturated",
