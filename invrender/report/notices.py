@@ -40,8 +40,8 @@ def map_notices(
     if fit.get("border_unseen"):
         note(
             "border-unseen",
-            "the sample's border is not to be seen in the photo, so that the maps may be shifted by "
-            "some millimetres: lay it on something plain of another brightness, or use the sheet",
+            "the sample's border is not to be seen in the photo, so that the maps may be shifted "
+            "by some millimetres: lay it on a plain table of other brightness, or use the sheet",
         )
     if clipped.any():
         note(
