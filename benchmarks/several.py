@@ -3,7 +3,8 @@
 Path-traced photographs of held-out materials under the patterns of a set, one after another; a hand
 moves camera and display before each. The first 1, 2, 3, 5 and 8 of them are explained together,
 with the lights that the ball shows and registered by the photos ("found"), with these lights at the
-true places ("true places"), and with the true lights at the true places ("true lights").
+true places ("true places"), and with the true lights at the true places ("true lights"). Then the
+same sample without a tablet: six photos, each under its own lamp, near and moved about.
 
 Photographs are kept in DIR/captures. Without folders, and with --quick, materials and rooms are
 procedural.
@@ -18,9 +19,10 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib import pyplot as plt
 from scipy import ndimage
 
 from benchmarks.common.captures import (
@@ -37,34 +39,40 @@ from benchmarks.refine import rerender_error
 from invrender.capture.lights import FoundLights, find_lights
 from invrender.capture.sample import Sample
 from invrender.capture.which_pattern import find_pattern
-from invrender.data.simulate_setup import hides
+from invrender.data.simulate_setup import Lamp, draw_lamps, hides, without_screen
 from invrender.files.capture import Capture, load_capture
 from invrender.files.maps import write_maps
 from invrender.files.rig_toml import read_rig, write_rig
 from invrender.files.write import write_exr
-from invrender.lights import Lights
+from invrender.lights import NO_PATTERN, Lights
 from invrender.maps import NAMES, Maps, crop_maps, map_errors, resize_maps
 from invrender.pattern.sets import COUNTS, pattern_set
-from invrender.pipeline import Stages, estimate_maps
+from invrender.pipeline import Stages, estimate_maps, load_networks
 from invrender.rig import Rig
 from invrender.types import Array, InputError, Vec3
+
+if TYPE_CHECKING:
+    from invrender.pipeline import Networks
 
 SEVERAL = CaptureSet("holdout", 390_000)
 NUMBERS = (1, *COUNTS)
 CAMERA_SHIFT, CAMERA_TILT = 2e-3, 1.0  # standard deviations, metres and degrees, of a hand
 NOISE = 0.005  # of the sensor
 SAMPLES, FINER = 256, 3  # of a texel; a side of a photo pixel, of texels
+LAMP_PHOTOS, LAMP_PATHS = 6, 256  # without a tablet: photos; paths of a texel
 WHOLE = 0.95  # of the most that a row or column has of the sample
 KINDS = (*NAMES, "average", "rerender")
 FOUND, PLACED, TRUE = STAGES = ("found", "true places", "true lights")
+NO_TABLET = "no tablet"
 RATIOS = {"normal": 0.45, "diffuse": 0.5, "roughness": 0.75, "average": 0.6, "rerender": 0.5}
 OF_A_SET = 5  # photos, whose errors the bars are for
+WITHOUT = 1.0  # average error without a tablet over one photo's with one
 
 Row = dict[str, Any]
 
 
 def hand_held(rng: np.random.Generator) -> Rig:
-    """The default rig as a hand holds it, the display beside the camera's view."""
+    """The default rig as a hand holds it, the sample in view and the display beside it."""
 
     def drawn(deviation: float) -> Vec3:
         x = np.clip(rng.normal(0, deviation, 3), -2 * deviation, 2 * deviation)
@@ -75,23 +83,30 @@ def hand_held(rng: np.random.Generator) -> Rig:
             screen_shift=drawn(SHIFT), screen_tilt=drawn(TILT),
             camera_shift=drawn(CAMERA_SHIFT), camera_tilt=drawn(CAMERA_TILT),
         )  # fmt: skip
-        if not hides(rig):
+        at = rig.project(rig.sample_corners, 3, 4)
+        if not hides(rig) and np.all((at > 0) & (at < [4, 3])):
             return rig
 
 
-def photograph_set(rig: Rig, maps: Maps, lights: Lights, width: int, spp: int, seed: int) -> Array:
-    """A photo (H, W, 3): ball and table path-traced, the sample's pixels from the fast estimator at
-    the maps' own resolution, since a path tracer's noise there would be that of a bad sensor."""
+def photograph_set(
+    rig: Rig, maps: Maps, lights: Lights, width: int, spp: int, seed: int, lamp: Lamp | None = None
+) -> Array:
+    """A photo (H, W, 3): ball and table path-traced, the sample at the maps' own resolution
+    from the fast estimator, to which a lamp adds paths of its own, which have little noise: that of
+    the rest would be a bad sensor's."""
     from invrender.render.fast.estimator import Fast
-    from invrender.render.path_traced import photograph
+    from invrender.render.path_traced import path_traced, photograph, sample_scene
     from invrender.render.scene import scene_under
 
     height = width * 3 // 4
     photo = photograph(
         rig, maps, lights.pattern, lights.environment, lights.gain,
-        height=height, width=width, spp=spp, seed=seed,
+        height=height, width=width, spp=spp, seed=seed, lamp=lamp,
     )  # fmt: skip
     shown = Fast(scene_under(lights), detail=2).render(maps, SAMPLES)
+    if lamp is not None:
+        alone = sample_scene(rig, maps, None, None, lamp=lamp)
+        shown += path_traced(alone, rig, *maps.shape, LAMP_PATHS, seed)
     corners = rig.project(rig.sample_corners, height, width)
     (x0, y0), (x1, y1) = np.floor(corners.min(0)).astype(int), np.ceil(corners.max(0)).astype(int)
     part = (np.arange(FINER) + 0.5) / FINER
@@ -111,27 +126,42 @@ def photograph_set(rig: Rig, maps: Maps, lights: Lights, width: int, spp: int, s
 
 
 def make_sets(
-    out: Path, count: int, photos: int, size: int, width: int, spp: int,
+    out: Path, chosen: Sequence[int], photos: int, lamps: int, size: int, width: int, spp: int,
     materials: Path | None, rooms: Path | None,
-) -> list[list[Path]]:  # fmt: skip
-    """Captures ``out``/000/1 and so on, a photo each; simulates those that are not there yet."""
+) -> list[tuple[list[Path], list[Path]]]:  # fmt: skip
+    """Captures ``out``/000/1 and so on under the patterns, and ``out``/000/lamp_1 and so on without
+    a tablet, a photo each; simulates those that are not there yet."""
     patterns = pattern_set(max(COUNTS))
-    sets = [[out / f"{k:03d}" / str(i + 1) for i in range(photos)] for k in range(count)]
-    for k, folders in enumerate(sets):
+    sets = [
+        (
+            [out / f"{k:03d}" / str(i + 1) for i in range(photos)],
+            [out / f"{k:03d}" / f"lamp_{i + 1}" for i in range(lamps)],
+        )
+        for k in chosen
+    ]
+    for k, (shown, lit) in zip(chosen, sets, strict=True):
         maps, room, _ = sample_and_room(k, SEVERAL, size, materials, rooms)
-        for i, folder in enumerate(folders):
+        moved = draw_lamps(SEVERAL.first_seed + k, lamps)
+        pictures: list[tuple[Path, Array, Lamp | None]] = [
+            *((folder, pattern, None) for folder, pattern in zip(shown, patterns, strict=False)),
+            *((folder, NO_PATTERN, lamp) for folder, lamp in zip(lit, moved, strict=True)),
+        ]
+        for i, (folder, pattern, lamp) in enumerate(pictures):
             if folder.exists():
                 continue
-            rig = hand_held(np.random.default_rng((SEVERAL.first_seed, k, i)))
-            lights = Lights(rig, patterns[i], room, GAIN)
+            rig, nominal = hand_held(np.random.default_rng((SEVERAL.first_seed, k, i))), Rig()
+            if lamp is not None:
+                rig, nominal = without_screen(rig), without_screen(nominal)
+            lights = Lights(rig, pattern, room, GAIN)
             folder.parent.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".") as name:
                 new = Path(name) / "capture"
                 (new / "truth").mkdir(parents=True)
-                photo = photograph_set(rig, maps, lights, width, spp, 8 * k + i)
+                photo = photograph_set(rig, maps, lights, width, spp, 16 * k + i, lamp)
                 write_exr(new / "photo.exr", photo, half=True)
-                write_exr(new / "pattern.exr", patterns[i], half=True)
-                write_rig(new / "rig.toml", Rig(), "pattern.exr", "truth/")
+                if lamp is None:
+                    write_exr(new / "pattern.exr", pattern, half=True)
+                write_rig(new / "rig.toml", nominal, "pattern.exr", "truth/")
                 write_rig(new / "truth" / "rig.toml", rig)
                 write_maps(new / "truth", maps, half=True, width=rig.sample_size)
                 write_exr(new / "truth" / "environment.exr", room, half=True)
@@ -153,7 +183,7 @@ def find(folder: Path, patterns: Sequence[Array], which: int) -> tuple[FoundLigh
 
 def known(found: FoundLights, folder: Path, stage: str) -> FoundLights:
     """What was found, with the true places of camera and display or the true lights instead."""
-    if stage == FOUND:
+    if stage in (FOUND, NO_TABLET):
         return found
     if stage == TRUE:
         return replace(found, lights=true_lights(folder, found.capture))
@@ -191,15 +221,18 @@ def shown_part(truth: Maps, found: FoundLights, folder: Path) -> tuple[Maps, tup
     return Maps(**images), part
 
 
-def measure(found: Sequence[FoundLights], folders: Sequence[Path], size: int, stage: str) -> Row:
+def measure(
+    found: Sequence[FoundLights], folders: Sequence[Path], size: int, stage: str,
+    networks: Networks | None = None,
+) -> Row:  # fmt: skip
     """The errors of the maps that so many photos give together."""
     stages = Stages()
     cpu = time.process_time()
     told = [known(f, p, stage) for f, p in zip(found, folders, strict=True)]
     crops = [Sample.of(f, size, whole=True) for f in told]
-    if stage != FOUND:
+    if stage in (PLACED, TRUE):
         crops = [replace(c, place=np.eye(3)) for c in crops]
-    _, result, _ = estimate_maps(crops, stages)
+    _, result, _ = estimate_maps(crops, stages, networks=networks)
     cpu = time.process_time() - cpu
     capture: Capture = found[0].capture
     assert capture.truth is not None
@@ -241,7 +274,32 @@ def bars(results: dict[str, dict[int, list[Row]]], recognised: float) -> list[Ba
             most, False)
         for kind, most in RATIOS.items()
     ]  # fmt: skip
+    for number, rows in results.get(NO_TABLET, {}).items():
+        ratio = pooled(rows, "average") / pooled(results[FOUND][1], "average")
+        lines.append(bar(f"average, {number} photos without a tablet", ratio, WITHOUT, False))
     return [*lines, bar("patterns recognised", recognised, 1.0, True)]
+
+
+def plot(results: dict[str, dict[int, list[Row]]], file: Path) -> None:
+    """Errors over one photo's against the number of photos, and against processor time."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.6), sharey=True)
+    one = {kind: pooled(results[FOUND][1], kind) for kind in KINDS}
+    for stage, by_number in results.items():
+        errors = [pooled(rows, "average") / one["average"] for rows in by_number.values()]
+        left.plot(list(by_number), errors, "o-", label=f"average, {stage}")
+        seconds = [np.mean([r["processor_seconds"] for r in rows]) for rows in by_number.values()]
+        right.plot(seconds, errors, "o-")
+    for kind in NAMES:
+        errors = [pooled(rows, kind) / one[kind] for rows in results[FOUND].values()]
+        left.plot(list(results[FOUND]), errors, ":", label=f"{kind}, {FOUND}")
+    left.set(xlabel="photos", ylabel="RMSE over one photo's")
+    right.set(xlabel="processor seconds, lights included", xscale="log", yscale="log")
+    left.legend(fontsize=7)
+    for axis in (left, right):
+        axis.grid(alpha=0.3, which="both")
+    figure.tight_layout()
+    figure.savefig(file, dpi=120)
+    plt.close(figure)
 
 
 def parser() -> argparse.ArgumentParser:
@@ -249,6 +307,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--size", type=int, default=256, help="pixels a side of the maps (256)")
     p.add_argument("--width", type=int, default=960, help="of the photos, pixels (960)")
     p.add_argument("--spp", type=int, default=24, help="samples a pixel of ball and table (24)")
+    p.add_argument("--first", type=int, default=0, help="number of the first sample (0)")
     p.add_argument("--numbers", type=int, nargs="+", default=NUMBERS, help="of photos")
     p.add_argument("--stages", nargs="+", choices=STAGES, default=STAGES)
     return p
@@ -256,34 +315,52 @@ def parser() -> argparse.ArgumentParser:
 
 def main(args: argparse.Namespace) -> None:
     if args.quick:
-        count, size, width, spp, numbers = 1, 64, 640, 24, [1, 3]
-        real = (None, None)
+        count, size, width, spp, numbers = 1, 48, 640, 16, [1, 3]
+        real, lamps = (None, None), 3
     else:
         count, size, width, spp, numbers = args.count, args.size, args.width, args.spp, args.numbers
-        real = (args.materials, args.envs)
+        real, lamps = (args.materials, args.envs), LAMP_PHOTOS
+    chosen = range(args.first, args.first + count)
     patterns = pattern_set(max(COUNTS))
-    sets = make_sets(args.out / "captures", count, max(numbers), size, width, spp, *real)
+    sets = make_sets(args.out / "captures", chosen, max(numbers), lamps, size, width, spp, *real)
     results: dict[str, dict[int, list[Row]]] = {
         stage: {n: [] for n in numbers} for stage in args.stages
     }
+    results[NO_TABLET] = {lamps: []}
     recognised = []
-    for folders in sets:
-        found = []
+    networks = load_networks()
+
+    def judge(
+        found: Sequence[FoundLights], seconds: float, folders: Sequence[Path], stage: str
+    ) -> None:
+        """A row for the photos, whose lights took so long each."""
+        row = measure(found, folders, size, stage, networks)
+        row["processor_seconds"] += seconds * len(found)
+        name = folders[0].parent.name
+        results[stage][len(found)].append({"sample": name, **row})
+        print(
+            f"{name}, {stage}, {len(found)}: "
+            + ", ".join(f"{kind} {row[kind]:.4f}" for kind in KINDS)
+            + f"; photos {', '.join(f'{e:.3f}' for e in row['photos'])}"
+            + f"; {row['processor_seconds']:.1f} processor s",
+            flush=True,
+        )
+
+    for folders, lit in sets:
+        cpu, found = time.process_time(), []
         for i, folder in enumerate(folders):
             lights, right = find(folder, patterns[: max(numbers)], i)
             found.append(lights)
             recognised.append(right)
+        cpu = (time.process_time() - cpu) / len(folders)
         for stage in args.stages:
             for n in numbers:
-                row = measure(found[:n], folders[:n], size, stage)
-                results[stage][n].append({"sample": folders[0].parent.name, **row})
-                print(
-                    f"{folders[0].parent.name}, {stage}, {n}: "
-                    + ", ".join(f"{kind} {row[kind]:.4f}" for kind in KINDS)
-                    + f"; photos {', '.join(f'{e:.3f}' for e in row['photos'])}"
-                    + f"; {row['processor_seconds']:.1f} processor s",
-                    flush=True,
-                )
+                judge(found[:n], cpu, folders[:n], stage)
+        cpu = time.process_time()
+        found = [find_lights(load_capture(folder)) for folder in lit]
+        judge(found, (time.process_time() - cpu) / len(lit), lit, NO_TABLET)
     share = float(np.mean(recognised))
     content = {"rows": results, "recognised": share, "bars": bars(results, share)}
+    args.out.mkdir(parents=True, exist_ok=True)
+    plot(results, args.out / "several.png")
     write_results(args.out, content, {"errors over those of one photo": error_table(results)})

@@ -82,6 +82,16 @@ NO_PATTERN: Array = np.zeros((1, 1, 3), np.float32)  # where the rig has no scre
 
 
 @dataclass(frozen=True)
+class NearLamp:
+    """A lamp that is near. place: its own, metres; seen_from: where the environment shows it from;
+    share (H, 2H): how much of each texel's radiance is its."""
+
+    place: Vec3
+    seen_from: Vec3
+    share: Array
+
+
+@dataclass(frozen=True)
 class Lights:
     """The screen's light and the room's, in one unit of radiance (a photo's, where one shows them).
 
@@ -89,6 +99,8 @@ class Lights:
     ``device`` makes of ``pattern`` (h, w, 3), linear values in [0, 1], row 0 at +y: ``shown``
     straight ahead, less towards the sides; `NO_PATTERN` of a rig without a screen. environment:
     linear RGB radiance (H, 2H, 3), row 0 at the zenith; zeros, as by default, for a dark room.
+
+    near: the lamp in the environment that is near, if any.
 
     What `invrender.find_lights` adds of a photo's mirror ball. coverage: (H, 2H), the share of each
     texel of the environment that the ball really shows, the rest is filled in. lamps: (H, 2H, 3),
@@ -122,6 +134,7 @@ class Lights:
     fit: dict[str, float] = field(default_factory=dict)
     device: Device = IDEAL
     lamps: Array | None = None
+    near: NearLamp | None = None
 
     @property
     def shown(self) -> Array:
@@ -149,8 +162,16 @@ class Lights:
         rig = replace(rig, camera_shift=tuple(np.add(rig.camera_shift, by).tolist()))
         if rig.has_screen:
             rig = replace(rig, screen_shift=tuple(np.add(rig.screen_shift, by).tolist()))
-        if not angle:
-            return replace(self, rig=rig)
         turned = partial(rotate_environment, angle=-angle % (2 * np.pi))
-        lamps = None if self.lamps is None else turned(self.lamps)
-        return replace(self, rig=rig, environment=turned(self.environment), lamps=lamps)
+        room, lamps, near = self.environment, self.lamps, self.near
+        if angle:
+            room, lamps = turned(room), None if lamps is None else turned(lamps)
+        if near is not None:
+            at, seen = (_vec3(turn.apply(p) + by) for p in (near.place, near.seen_from))
+            share = turned(near.share[..., None])[..., 0] if angle else near.share
+            near = NearLamp(at, seen, share)
+        return replace(self, rig=rig, environment=room, lamps=lamps, near=near)
+
+
+def _vec3(v: Array) -> Vec3:
+    return float(v[0]), float(v[1]), float(v[2])

@@ -195,6 +195,7 @@ def estimate_maps(
             explain_photos,
             flat_start,
             observe,
+            plain_start,
         )
 
     own, free = crops, len(crops) > 1 and any(c.place is None for c in crops)
@@ -203,12 +204,16 @@ def estimate_maps(
             crops = place_samples(own)
     with stage("forward model"):
         photos = [observe(c.photo, c.lights, c.clipped) for c in crops]
-    if networks is None:
+    measured = len(photos) >= MEASURING_PHOTOS
+    if measured and not any(c.lights.rig.has_screen for c in crops):
+        with stage("initial maps"):
+            initial = plain_start(photos, samples)
+    elif networks is None:
         with stage("initial maps"):
             initial = flat_start(photos, samples)
     else:
         initial = _ask_networks(networks, crops, photos, samples, stage)
-    if free and len(photos) >= MEASURING_PHOTOS and not initial.interrupted:
+    if free and measured and not initial.interrupted:
         with stage("registration"):
             photos = _registered(photos, own, crops, initial.prior.mean)
     with stage("refine"):

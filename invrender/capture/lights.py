@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,6 +18,7 @@ from invrender.capture.environment import fill_environment, unfold_environment
 from invrender.capture.glare import remove_glare
 from invrender.capture.hidden_lamp import add_hidden_lamp
 from invrender.capture.mirror import Ball
+from invrender.capture.near_lamp import find_near_lamp
 from invrender.capture.orientation import find_ball_and_orientation, not_the_pattern
 from invrender.capture.response import Response
 from invrender.capture.screen import Screen, fit_screen
@@ -252,8 +254,11 @@ def _measure_room(
         photo, rig, image, (NO_PATTERN, np.zeros(3), IDEAL), environment, coverage
     )
     environment = fill_environment(environment, coverage)
+    near = find_near_lamp(photo, rig, image.ball, environment)
+    if near is not None:
+        fit["lamp_distance"] = math.dist(near.place, near.seen_from)
     gain = np.zeros(3, np.float32)
-    return Lights(rig, NO_PATTERN, environment, gain, coverage, None, fit, lamps=lamps)
+    return Lights(rig, NO_PATTERN, environment, gain, coverage, None, fit, lamps=lamps, near=near)
 
 
 def _mirror_numbers(capture: Capture, rig: Rig, ball: Ball) -> dict[str, float]:

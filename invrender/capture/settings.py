@@ -538,6 +538,19 @@ class Vignetting:
 
 
 @dataclass(frozen=True)
+class NearLampSearch:
+    """A lamp that is near: `invrender.capture.near_lamp`."""
+
+    bright: float = 5.0  # of the sky's median radiance, a lamp's; by hand
+    share: float = 0.3  # of the light on the table, that it gives at least; by hand
+    widest: float = 25.0  # degrees, root mean square about its middle; by hand
+    nearest: float = 2.0  # sizes of the sample; by hand
+    steps: int = 61  # of its nearness, from nought; by hand
+    # Spread of the table's brightness with the distance over that without, at most; by hand.
+    ratio: float = 0.9
+
+
+@dataclass(frozen=True)
 class HiddenLamp:
     """A lamp behind the screen: `invrender.capture.hidden_lamp`."""
 
@@ -592,5 +605,6 @@ UNFOLDING = Unfolding()
 TABLE_METER = TableMeter()
 CLIPPED_LAMPS = ClippedLamps()
 VIGNETTING = Vignetting()
+NEAR_LAMP = NearLampSearch()
 HIDDEN_LAMP = HiddenLamp()
 CROP = Crop()

@@ -17,10 +17,10 @@ from invrender.refine.lobes import fit_lobes
 from invrender.refine.mirrors import take_mirrors
 from invrender.refine.posterior import explain
 from invrender.refine.priors import Prior, lobe_prior, pooled
-from invrender.refine.several import explain_together, likeliest
+from invrender.refine.several import explain_together, likeliest, plain_prior
 from invrender.refine.shared import light_doubt, share
 from invrender.refine.theta import to_maps
-from invrender.render.fast.estimator import Fast
+from invrender.render.near import renderer_under
 from invrender.types import Array, Mask
 
 MEASURING_PHOTOS = 3  # photos from which these count for more than what networks know
@@ -49,7 +49,7 @@ class Initial:
 def observe(photo: Array, lights: Lights, clipped: Mask) -> Observation:
     """A photo of the sample with its forward model."""
     mask = clipped if clipped.any() else None
-    return Observation(photo, Fast.under(lights), mask, light_doubt(lights.fit), lights.lamps)
+    return Observation(photo, renderer_under(lights), mask, light_doubt(lights.fit), lights.lamps)
 
 
 def flat_start(photos: Sequence[Observation], samples: int) -> Initial:
@@ -57,6 +57,12 @@ def flat_start(photos: Sequence[Observation], samples: int) -> Initial:
     first = photos[0]
     prior = lobe_prior(fit_lobes(first.photo, first.renderer, samples))
     return Initial(flat_maps(first.photo, first.renderer, samples), [prior], flat=True)
+
+
+def plain_start(photos: Sequence[Observation], samples: int) -> Initial:
+    """For several photos without a display: what all of them say of a flat sample."""
+    prior = plain_prior(photos, samples)
+    return Initial(to_maps(prior.mean), [prior], flat=True)
 
 
 def explain_photos(

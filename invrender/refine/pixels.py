@@ -34,7 +34,7 @@ class Settings:
     exposure_found: float = 0.02  # and of what is found of it
     unlikely: float = 9.0  # mean squared residual over its variance that counts half
     diffuse: float = 0.3  # prior deviations of θ, of a dielectric
-    dielectric_f0: float = 0.01
+    dielectric_f0: float = 0.003  # with 0.01 it grows with the photos, and takes up their errors
     roughness: float = 0.25
     slope: float = 0.6  # at most, of what the photos show of the relief
     least_slope: float = 0.05
@@ -42,6 +42,9 @@ class Settings:
     metal_diffuse: float = 0.01  # and of a metal
     metal_f0: float = 0.3
     f0_range: tuple[float, float] = (0.08, 0.2)  # surely dielectric; surely metal
+    metal_start: float = 0.6  # f0 of a metal of which nothing else is known
+    metal_better: float = 0.5  # cost of an area's pixels as metal, over that as dielectric, at most
+    area: int = 5  # pixels a side of such an area, of `grid`
     correlation: tuple[float, float] = (0.9, 0.95)  # of the colours of k_d, and of k_s
     fixed: float = 0.01  # prior deviation of a roughness that is tried
     tried: int = 3  # steps for each of these

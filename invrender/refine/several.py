@@ -22,12 +22,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy import ndimage
 
+from invrender.refine.flat import flat_maps
 from invrender.refine.gauss_newton import BAND, Observation, Refined, linearise
 from invrender.refine.pixels import TOGETHER, Photo, Problem, Settings, noise_of, wide_deviations
-from invrender.refine.priors import Prior
+from invrender.refine.priors import Prior, channel_correlation
+from invrender.refine.registration import factor_deviations
 from invrender.refine.shared_roughness import Pooled, pool_roughness
-from invrender.refine.theta import N, R, project, to_maps
+from invrender.refine.theta import D, N, R, S, project, to_maps, to_theta
 from invrender.sampling import centres, resize, resize_pattern
 from invrender.types import TINY, Array
 
@@ -58,6 +61,30 @@ def likeliest(
         point, _ = problem.solve(problem.mean, s.few)
         costs.append(float(point.cost.mean()))
     return priors[int(np.argmin(costs))]
+
+
+def plain_prior(observations: Sequence[Observation], samples: int, s: Settings = TOGETHER) -> Prior:
+    """A flat sample's prior, without what networks say: theirs is of a display's light. Its diffuse
+    albedo is the photos' median; but where bare metal explains the photos of an area better by far,
+    it is that."""
+    flat = [flat_maps(o.photo, o.renderer, samples) for o in observations]
+    theta = to_theta(flat[0])
+    theta[..., D] = np.median([f.diffuse for f in flat], 0)
+    metal = theta.copy()
+    grey = np.maximum(theta[..., D].mean(-1, keepdims=True), TINY)
+    metal[..., S] = np.clip(theta[..., D] / grey * s.metal_start, 0, 1)
+    metal[..., D] = 0
+    photos = [Photo.of(o) for o in observations]
+    costs = []
+    for trial in (theta, metal):
+        problem = _small(photos, trial, s.roughness, samples, s)
+        cost = problem.search(problem.mean, s.tried)[0].cost
+        costs.append(ndimage.uniform_filter(cost, s.area, mode="nearest"))
+    share = np.asarray(costs[1] < s.metal_better * costs[0], np.float32)
+    is_metal = resize(share[..., None], *theta.shape[:2]) > 0.5
+    theta = np.where(is_metal, metal, theta).astype(np.float32)
+    sigma = wide_deviations(theta, np.full(theta.shape[:2], s.roughness, np.float32), s)
+    return Prior(theta, sigma, channel_correlation(*s.correlation))
 
 
 def explain_together(
@@ -128,7 +155,8 @@ def _calibrate(
         ratio = np.log(np.maximum(photo.observation.photo, TINY) / np.maximum(image, TINY))
         logs[i] = np.median(ratio.reshape(-1, 3), 0)
     logs -= logs.mean(0)
-    spread = s.exposure**2
+    doubts = [factor_deviations(p.observation)[0] for p in photos.values()]
+    spread = np.array([min(s.exposure, d) ** 2 for d in doubts])[:, None]
     logs *= spread / (spread + s.exposure_found**2)
     out = []
     for photo, own, log in zip(photos.values(), scatter, logs, strict=True):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from invrender.lights import Lights
 from invrender.maps import Maps
-from invrender.render.fast.estimator import Fast
+from invrender.render.near import renderer_under
 from invrender.types import Array
 
 
@@ -17,4 +17,4 @@ def render(maps: Maps, lights: Lights, *, samples: int = 256, seed: int = 0) -> 
 
         image = invrender.render(maps, invrender.Lights(Rig(), pattern, gain=2.0))
     """
-    return Fast.under(lights).render(maps, samples, seed)
+    return renderer_under(lights).render(maps, samples, seed)

@@ -26,6 +26,8 @@ mi.set_log_level(mi.LogLevel.Error)  # it warns of sample counts that it rounds
 # Of the screen's size: the table lies so far below the sample, the bezel so far above the lit area.
 SAMPLE_LIFT = 1e-4
 UP = np.array([0, 0, 1], np.float32)
+# With a lamp: of the spp, the samples of the ball's window, which reaches so many of its radii.
+LAMP_FACTOR, BALL_WINDOW = 16, 1.3
 # A glowing sphere: its centre and radius in metres, its radiance (RGB).
 Lamp = tuple[Vec3, float, Vec3]
 
@@ -463,45 +465,56 @@ def photograph(
     camera, (right, up, back) = rig.camera, rig.camera_axes
     table = np.broadcast_to(np.asarray(table, dtype=float), 3)
     depth = SAMPLE_LIFT * size - (0.0 if relief is None else min(float(relief.min()), 0.0))
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "path", "max_depth": max_depth},
-            "sensor": {
-                "type": "perspective",
-                "fov": rig.fov,
-                "fov_axis": "x",
-                "near_clip": 1e-3 * size,
-                "far_clip": 1e3 * size,
-                # Mitsuba's camera looks along its z and has its x to the left.
-                "to_world": _transform([-right, up, -back, camera]),
-                "film": {
-                    "type": "hdrfilm",
-                    "width": width,
-                    "height": height,
-                    "rfilter": {"type": "box"},
-                    "pixel_format": "rgb",
-                    "component_format": "float32",
-                },
-                "sampler": {"type": "multijitter", "sample_count": spp},
+    described: dict[str, Any] = {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": max_depth},
+        "sensor": {
+            "type": "perspective",
+            "fov": rig.fov,
+            "fov_axis": "x",
+            "near_clip": 1e-3 * size,
+            "far_clip": 1e3 * size,
+            # Mitsuba's camera looks along its z and has its x to the left.
+            "to_world": _transform([-right, up, -back, camera]),
+            "film": {
+                "type": "hdrfilm",
+                "width": width,
+                "height": height,
+                "rfilter": {"type": "box"},
+                "pixel_format": "rgb",
+                "component_format": "float32",
             },
-            "sample": _sample(rig, maps, relief),
-            "table": {
-                "type": "rectangle",
-                "to_world": mi.ScalarTransform4f()
-                .translate([0, 0, -depth])
-                .scale([100 * size, 100 * size, 1]),
-                "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(table)}},
-            },
-            "ball": {
-                "type": "sphere",
-                "center": list(map(float, rig.ball_centre if ball is None else ball)),
-                "radius": rig.ball_radius,
-                "bsdf": _mirror(rig.ball_reflectance, ball_alpha),
-            },
-            **({} if cover is None else {"cover": _paper(*cover, depth - SAMPLE_LIFT * size / 2)}),
-            **_lights(rig, pattern, environment, gain, device),
-            **_lamp(lamp),
-        }
-    )
-    return np.array(mi.render(scene, spp=spp, seed=seed))
+            "sampler": {"type": "multijitter", "sample_count": spp},
+        },
+        "sample": _sample(rig, maps, relief),
+        "table": {
+            "type": "rectangle",
+            "to_world": mi.ScalarTransform4f()
+            .translate([0, 0, -depth])
+            .scale([100 * size, 100 * size, 1]),
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(table)}},
+        },
+        "ball": {
+            "type": "sphere",
+            "center": list(map(float, rig.ball_centre if ball is None else ball)),
+            "radius": rig.ball_radius,
+            "bsdf": _mirror(rig.ball_reflectance, ball_alpha),
+        },
+        **({} if cover is None else {"cover": _paper(*cover, depth - SAMPLE_LIFT * size / 2)}),
+        **_lights(rig, pattern, environment, gain, device),
+        **_lamp(lamp),
+    }
+    photo = np.array(mi.render(mi.load_dict(described), spp=spp, seed=seed))
+    if lamp is not None:  # its image in the ball is small
+        x, y = rig.project(described["ball"]["center"], height, width)
+        reach = BALL_WINDOW * rig.focal(width) * rig.ball_radius / camera[2]
+        x0, y0 = max(0, int(x - reach)), max(0, int(y - reach))
+        x1, y1 = min(width, int(x + reach) + 1), min(height, int(y + reach) + 1)
+        if x1 > x0 and y1 > y0:
+            crop = {"crop_offset_x": x0, "crop_offset_y": y0, "crop_width": x1 - x0,
+                    "crop_height": y1 - y0}  # fmt: skip
+            sensor = described["sensor"]
+            described["sensor"] = {**sensor, "film": {**sensor["film"], **crop}}
+            part = mi.render(mi.load_dict(described), spp=LAMP_FACTOR * spp, seed=seed)
+            photo[y0:y1, x0:x1] = np.array(part)
+    return photo

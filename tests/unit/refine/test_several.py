@@ -7,12 +7,13 @@ import pytest
 
 from invrender.data.environments import procedural_environment
 from invrender.data.materials import procedural_material
-from invrender.lights import Lights
+from invrender.data.simulate_setup import without_screen
+from invrender.lights import NO_PATTERN, Lights
 from invrender.maps import constant_maps, map_errors
 from invrender.pattern.default import default_pattern
 from invrender.refine.gauss_newton import Observation
 from invrender.refine.priors import network_prior
-from invrender.refine.several import by_pattern, explain_together, likeliest
+from invrender.refine.several import by_pattern, explain_together, likeliest, plain_prior
 from invrender.refine.shared_roughness import TRIED_ROUGHNESS, pool_roughness
 from invrender.refine.theta import R, to_maps, to_theta
 from invrender.render.fast.estimator import Fast
@@ -138,3 +139,35 @@ def test_the_likelier_prior_is_taken(truth, renderers):
 def test_photos_under_the_known_pattern_come_first():
     known = default_pattern()
     assert by_pattern([half(0, 0), known, half(1, 0), known[::2, ::2]], known)[:2] == [1, 3]
+
+
+@pytest.fixture(scope="module")
+def lamps():
+    """Six photos' lights without a screen: a lamp in a room, moved about."""
+    room = scale_environment(procedural_environment(3, 64), 0.5)
+    rig = without_screen(Rig())
+    lights = []
+    for k in range(6):
+        lit = room.copy()
+        row = (8, 16)[k % 2]
+        column = 64 * 2 * k // 6
+        lit[row : row + 2, column : column + 3] += 400
+        lights.append(Lights(rig, NO_PATTERN, lit, 0.0))
+    return [Fast.under(x) for x in lights]
+
+
+@pytest.mark.parametrize("kind", ["leather", "rusty_metal"])
+def test_lamps_alone_measure_dielectrics_and_metals(lamps, kind):
+    truth = procedural_material(5, SIZE, SIZE, kind=kind)
+    photos = photos_of(truth, lamps)
+    prior = plain_prior(photos, 64)
+    found_metal = prior.mean[..., 3:6].mean(-1) > 0.2
+    metal = truth.specular.mean(-1) > 0.3
+    assert np.mean(found_metal == metal) > 0.8
+    before, after = (
+        map_errors(maps, truth) for maps in (to_maps(prior.mean), explained(photos, prior).maps)
+    )
+    assert after["average"] < before["average"]
+    if not metal.any():
+        assert after["normal"] < 0.3 * before["normal"]
+        assert after["average"] < 0.5 * before["average"]
