@@ -41,9 +41,9 @@ class WithNearLamp(Renderer):
 
     def scaled(self, screen: Any, room: Any, added: Any = None) -> Self:
         own = self.near.share[..., None]
-        more = (None, None) if added is None else (added * (1 - own), added * own)
-        parts = zip((self.room, self.lamp), more, strict=True)
-        return type(self)(*(p.scaled(screen, room, a) for p, a in parts), self.near)
+        rest, more = (None, None) if added is None else (added * (1 - own), added * own)
+        lamp = self.lamp.scaled(screen, room, more)
+        return type(self)(self.room.scaled(screen, room, rest), lamp, self.near)
 
     def _shade(
         self, view: View, roughness: Any, normal: Any, samples: int, jacobian: bool
