@@ -155,7 +155,7 @@ def test_deviations_for_several_photos():
     theta[0, 1, S] = 0.6
     s = several.TOGETHER
     sigma = pixels.wide_deviations(theta, np.full((1, 2), 0.07, np.float32), s)
-    np.testing.assert_allclose(sigma[0, 0], [0.3] * 3 + [0.01] * 3 + [0.07] + [0.6] * 2, rtol=1e-5)
+    np.testing.assert_allclose(sigma[0, 0], [0.3] * 3 + [0.003] * 3 + [0.07] + [0.6] * 2, rtol=1e-5)
     np.testing.assert_allclose(sigma[0, 1], [0.01] * 3 + [0.3] * 3 + [0.07] + [0.6] * 2, rtol=1e-5)
 
 
