@@ -5,8 +5,9 @@ its photo alone, with estimated lights; from the network's maps and, beside it, 
 What the estimate costs is told by the network's start with the true lights. The photographs are of
 materials and rooms of holdout.txt, looked at during development; ``--others`` adds as many of
 holdout_families.txt, with other noise and seeds: only for a final run, they are the ones that
-count (parts of materials of which development has seen others). Captures are kept in DIR/captures and DIR/others: a rerun only refines. Without folders,
-and with --quick, materials and rooms are procedural.
+count (parts of materials of which development has seen others). Captures are kept in DIR/captures
+and DIR/others: a rerun only refines. Without folders, and with --quick, materials and rooms are
+procedural.
 """
 
 from __future__ import annotations
