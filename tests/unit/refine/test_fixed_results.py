@@ -7,6 +7,7 @@ stores them anew, and says in the commit what became better.
 
 import json
 import sys
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -18,9 +19,11 @@ from invrender.lights import Lights
 from invrender.maps import constant_maps
 from invrender.pattern.sets import pattern_set
 from invrender.refine.checks import baked_light, coarse_error
+from invrender.refine.flat import plane_terms
 from invrender.refine.gauss_newton import Observation, refine
-from invrender.refine.lobes import fit_lobes, read_lobes
+from invrender.refine.lobes import _plainness, fit_lobes, read_lobes
 from invrender.refine.mirrors import take_mirrors
+from invrender.refine.pixels import TOGETHER
 from invrender.refine.posterior import explain
 from invrender.refine.priors import lobe_prior, network_prior, pooled
 from invrender.refine.registration import register
@@ -121,7 +124,11 @@ def pixels():
 def lobes():
     found = read_lobes(photo(), renderer())
     plain = fit_lobes(photo(), renderer())
-    return {**vars(found.evidence), **found.maps.encoded(),
+    e, b, a = plane_terms(renderer(), 16, 16, 0.2, 64)
+    small = photo()[:16, :16]
+    b[:4] *= 1e-3  # where nothing is mirrored
+    texture = np.array([_plainness(small, e, b, a, metal) for metal in (False, True)])
+    return {**vars(found.evidence), **found.maps.encoded(), "texture": texture,
             **{f"fitted {n}": x for n, x in plain.encoded().items()}}  # fmt: skip
 
 
@@ -134,7 +141,7 @@ def mirrors():
 
 
 def together():
-    found = explain_together(several(), prior())
+    found = explain_together(several(), prior(), s=replace(TOGETHER, whole=16))  # two sizes
     return {**of_refined(found), "errors": np.array(found.photo_errors)}
 
 
