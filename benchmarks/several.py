@@ -169,16 +169,20 @@ def make_sets(
     return sets
 
 
-def find(folder: Path, patterns: Sequence[Array], which: int) -> tuple[FoundLights, bool]:
-    """The lights of a photo under one of several patterns, and whether that was recognised."""
-    capture = load_capture(folder)
+def find(folder: Path, patterns: Sequence[Array], which: int) -> tuple[FoundLights | None, bool]:
+    """The lights of a photo under one of several patterns, None where its ball is not found; and
+    whether the pattern was recognised."""
+    capture, found = load_capture(folder), -1
+    if patterns:
+        try:
+            seen, found = find_pattern(capture, patterns)
+        except InputError:
+            found = -1
     try:
-        seen, found = find_pattern(capture, patterns)
-    except InputError:
-        found = -1
-    if found != which:
-        seen = capture
-    return find_lights(seen), found == which
+        return find_lights(seen if found == which and patterns else capture), found == which
+    except InputError as error:
+        print(f"{folder}: {error}", flush=True)
+        return None, False
 
 
 def known(found: FoundLights, folder: Path, stage: str) -> FoundLights:
@@ -316,28 +320,28 @@ def parser() -> argparse.ArgumentParser:
 def main(args: argparse.Namespace) -> None:
     if args.quick:
         count, size, width, spp, numbers = 1, 48, 640, 16, [1, 3]
-        real, lamps = (None, None), 3
+        real, lamps, stages = (None, None), 3, [FOUND]
     else:
         count, size, width, spp, numbers = args.count, args.size, args.width, args.spp, args.numbers
-        real, lamps = (args.materials, args.envs), LAMP_PHOTOS
+        real, lamps, stages = (args.materials, args.envs), LAMP_PHOTOS, args.stages
     chosen = range(args.first, args.first + count)
     patterns = pattern_set(max(COUNTS))
     sets = make_sets(args.out / "captures", chosen, max(numbers), lamps, size, width, spp, *real)
-    results: dict[str, dict[int, list[Row]]] = {
-        stage: {n: [] for n in numbers} for stage in args.stages
-    }
+    results: dict[str, dict[int, list[Row]]] = {stage: {n: [] for n in numbers} for stage in stages}
     results[NO_TABLET] = {lamps: []}
     recognised = []
     networks = load_networks()
 
     def judge(
-        found: Sequence[FoundLights], seconds: float, folders: Sequence[Path], stage: str
+        found: Sequence[FoundLights | None], seconds: float, folders: Sequence[Path], stage: str
     ) -> None:
-        """A row for the photos, whose lights took so long each."""
-        row = measure(found, folders, size, stage, networks)
+        """A row for the photos, whose lights took so long each; those without a ball are left out,
+        as `invrender refine` does."""
+        used = [(f, p) for f, p in zip(found, folders, strict=True) if f is not None]
+        row = measure([f for f, _ in used], [p for _, p in used], size, stage, networks)
         row["processor_seconds"] += seconds * len(found)
         name = folders[0].parent.name
-        results[stage][len(found)].append({"sample": name, **row})
+        results[stage][len(found)].append({"sample": name, "used": len(used), **row})
         print(
             f"{name}, {stage}, {len(found)}: "
             + ", ".join(f"{kind} {row[kind]:.4f}" for kind in KINDS)
@@ -347,17 +351,18 @@ def main(args: argparse.Namespace) -> None:
         )
 
     for folders, lit in sets:
-        cpu, found = time.process_time(), []
-        for i, folder in enumerate(folders):
-            lights, right = find(folder, patterns[: max(numbers)], i)
-            found.append(lights)
-            recognised.append(right)
+        cpu = time.process_time()
+        told = [find(folder, patterns[: max(numbers)], i) for i, folder in enumerate(folders)]
+        found = [lights for lights, _ in told]
+        recognised += [right for _, right in told]
         cpu = (time.process_time() - cpu) / len(folders)
-        for stage in args.stages:
+        if found[0] is None:  # there is no photo to compare with
+            continue
+        for stage in stages:
             for n in numbers:
                 judge(found[:n], cpu, folders[:n], stage)
         cpu = time.process_time()
-        found = [find_lights(load_capture(folder)) for folder in lit]
+        found = [find(folder, [], -1)[0] for folder in lit]
         judge(found, (time.process_time() - cpu) / len(lit), lit, NO_TABLET)
     share = float(np.mean(recognised))
     content = {"rows": results, "recognised": share, "bars": bars(results, share)}

@@ -208,6 +208,10 @@ def _solve_all(
     mean = theta.copy()
     mean[..., R] = rho
     prior = wide_deviations(mean, spread, s)
+    # What networks know of the diffuse albedo is worth something where photos do not measure it.
+    prior[..., D] = np.minimum(
+        prior[..., D], np.maximum(s.trusted * sigma[..., D], s.least_diffuse)
+    )
     start, steps = mean, s.steps
     if max(height, width) > s.whole:
         scale = s.whole / max(height, width)
@@ -216,7 +220,7 @@ def _solve_all(
         before = coarse.copy()
         before[..., R] = pooled.roughness(coarse)[0]
         few = [p.shrunk(*low) for p in photos]
-        _solve_all(few, pooled, coarse, np.empty_like(coarse), samples, s)
+        _solve_all(few, pooled, coarse, resize(sigma, *low), samples, s)
         start, steps = project(mean + resize(coarse - before, height, width)), s.few
     squares, seen, converged = np.zeros(len(photos)), np.zeros(len(photos)), True
     rows = max(1, BAND // width)
