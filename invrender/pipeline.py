@@ -16,6 +16,7 @@ import numpy as np
 from invrender.capture.lights import FoundLights
 from invrender.capture.photos import find_every_light, read_captures, without_photo
 from invrender.capture.sample import Sample, place_samples
+from invrender.files.capture import check_count
 from invrender.files.output import check_output
 from invrender.maps import Maps
 from invrender.pattern.default import default_pattern
@@ -107,6 +108,7 @@ def prepare(
     """The lights of the folders' captures, and the sample as each photo shows it, ``size`` pixels a
     side; a photo alone is no longer needed then, and left out. known: of `find_lights`."""
     stage = stage or Stages()
+    check_count(len(folders), "the command")
     with stage("read"):
         captures = [shown for folder in folders for shown in read_captures(folder)]
     with stage("lights"):

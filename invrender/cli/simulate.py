@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 
-LAMP_PHOTOS, MOST_PHOTOS = 6, 40  # without a tablet
+LAMP_PHOTOS = 6  # without a tablet
 
 
 def add_parser(commands: Any) -> None:
@@ -59,6 +59,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     from invrender.data.materials import procedural_material, read_material
     from invrender.data.simulate import simulate, simulate_real
     from invrender.data.simulate_setup import draw_lamps, draw_setup, without_screen
+    from invrender.files.capture import MOST_PHOTOS
     from invrender.files.images import read_image
     from invrender.files.output import check_output
     from invrender.lights import NO_PATTERN

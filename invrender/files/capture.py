@@ -17,6 +17,7 @@ from invrender.rig import Rig
 from invrender.types import Array, InputError, Notice
 
 MIN_PHOTO = 64
+MOST_PHOTOS = 20  # of a sample; they add little beyond eight
 PATTERN_FILES = "pattern.exr", "pattern.png"
 
 
@@ -134,8 +135,10 @@ def load_set(folder: str | Path) -> tuple[list[Capture], list[Array]]:
     folder = Path(folder)
     names = sorted(set_patterns(folder), key=lambda p: (len(p.stem), p.stem))
     captures, patterns = [], []
+    paths = find_photos(folder)
+    check_count(len(paths), str(folder))
     truth: tuple[Maps | None, Array | None] | None = None
-    for path in find_photos(folder):
+    for path in paths:
         photo = read_photo(path)
         check_photo(photo, str(path))
         given = read_rig(folder / "rig.toml", fov=photo.fov)
@@ -146,6 +149,15 @@ def load_set(folder: str | Path) -> tuple[list[Capture], list[Array]]:
         name = f"{folder.resolve().name}/{path.stem}"
         captures.append(_capture(photo, given, pattern, name, *truth))
     return captures, patterns
+
+
+def check_count(count: int, name: str) -> None:
+    """Raise `InputError` for more photos than are held in memory and explained together."""
+    if count > MOST_PHOTOS:
+        raise InputError(
+            f"{name} has {count} photos, and at most {MOST_PHOTOS} are taken together: leave out "
+            "those that are much alike"
+        )
 
 
 def holds_set(folder: Path) -> bool:

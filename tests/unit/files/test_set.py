@@ -53,3 +53,10 @@ def test_photos_without_a_screen_have_each_their_own_light(folder):
     write_exr(folder / "pattern.exr", np.ones((4, 4, 3)))
     with pytest.raises(InputError, match=r"rig.toml no \[screen\]"):
         load_set(folder)
+
+
+def test_too_many_photos_are_refused_before_they_are_read(folder):
+    for i in range(3, 42):
+        (folder / f"photo_{i}.exr").write_bytes(b"not read")
+    with pytest.raises(InputError, match="41 photos, and at most 20"):
+        load_set(folder)
