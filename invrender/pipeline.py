@@ -223,6 +223,12 @@ def estimate_maps(
             photos, initial, samples, stage.part("refine"),
             lambda i, e: stage.progress(f"refine: step {i}, photo error {e:.4f}"),
         )  # fmt: skip
+    kept = [i for i in range(len(own)) if i not in refined.left_out]
+    if free and refined.left_out and kept[0] == 0 and not refined.interrupted:
+        # What does not belong to the sample has spoilt the others' places too.
+        start, again, photos = estimate_maps([own[i] for i in kept], stage, init, samples, networks)
+        again.left_out = sorted([*refined.left_out, *(kept[i] for i in again.left_out)])
+        return start, again, photos
     return initial.maps, refined, photos
 
 
