@@ -34,6 +34,7 @@ class Settings:
     exposure_found: float = 0.02  # and of what is found of it
     unlikely: float = 9.0  # mean squared residual over its variance that counts half
     diffuse: float = 0.3  # prior deviations of θ, of a dielectric
+    unexplained: float = 0.3  # of the photos' means, from which on the initial maps are kept
     trusted: float = 1.0  # times what is expected of the initial maps' errors, of that of k_d
     least_diffuse: float = 0.01  # that deviation, at least
     dielectric_f0: float = 0.003  # with 0.01 it grows with the photos, and takes up their errors

@@ -110,7 +110,11 @@ def explain_together(
         pooled = _pool(photos, theta, sigma[..., R], samples, s)
         s = replace(s, slope=_relief(photos, pooled, theta, samples, s))
         progress(0.4)
+        start, expected = theta.copy(), sigma.copy()
         errors, result.converged = _solve_all(photos, pooled, theta, sigma, samples, s)
+        if np.sqrt(np.mean(np.square(errors))) > s.unexplained:
+            # What does not explain the photos has measured nothing.
+            theta[...], sigma[...], result.converged = start, expected, False
         result.photo_errors, result.left_out = errors, left_out
         error = float(np.sqrt(np.mean(np.square(errors))))
         result.history = [{"seconds": time.perf_counter() - began, "photo_error": error}]
