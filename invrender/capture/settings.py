@@ -294,7 +294,7 @@ class Orientation:
     least_spread: float = 1e-3  # of the means' product, of a channel that counts; by hand
     saturated: float = 0.98  # of white, beside which a look-up of a saturated pixel lies; by hand
     brightest: float = 0.05  # share of cells whose brightness does not count; by hand
-    telling: float = 0.2  # share of the screen that must not be white to tell the pattern; by hand
+    telling: float = 0.3  # share of the screen that must not be white to tell the pattern; by hand
 
 
 @dataclass(frozen=True)
