@@ -259,6 +259,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--size", type=int, default=256, help="pixels a side of the maps (256)")
     p.add_argument("--width", type=int, default=1280, help="of the photos (1280)")
     p.add_argument("--spp", type=int, default=64, help="samples of the path tracer (64)")
+    p.add_argument("--first", type=int, default=0, help="photograph to begin with (0)")
     p.add_argument("--straight", type=int, default=40, help="photos of a straight camera (40)")
     p.add_argument("--effects", type=int, default=6, help="samples to try each effect on (6)")
     return p
@@ -273,7 +274,7 @@ def main(args: argparse.Namespace) -> None:
     drawn = DEVELOPMENT if args.development else FINAL
     captures, rows_at = args.out / "captures", args.out / "rows"
     rows: list[Row] = []
-    for k in range(args.count):
+    for k in range(args.first, args.first + args.count):
         folder, twin = captures / f"{k:03d}", captures / f"ideal-{k // 3:03d}"
         kind = make_real(folder, k, drawn, size, args)
         make_ideal(twin, k // 3, drawn, size, args)

@@ -533,8 +533,9 @@ def _straightened(photo: Photo, camera: _Camera) -> tuple[Photo, _Camera]:
         return np.asarray(cv2.remap(image, *at, cv2.INTER_LINEAR, borderMode=border))
 
     image = moved(photo.image)
-    if photo.clip_level is not None:  # a pixel beside a saturated one counts as that
-        image[moved(photo.clipped.astype(np.float32)) > 0] = photo.clip_level
+    if photo.clip_level is not None:  # a channel beside a saturated one counts as that
+        full = moved((photo.image >= photo.clip_level).astype(np.float32)) > 0
+        image[full] = np.maximum(image[full], photo.clip_level)
     pinhole = replace(camera, centre=np.array([width, height]) / 2, distortion=0.0)
     return replace(photo, image=image), pinhole
 

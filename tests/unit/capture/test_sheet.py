@@ -147,6 +147,18 @@ def test_optics_are_undone(bent):
     assert abs(found.distortion) < 0.004
 
 
+def test_a_saturated_channel_leaves_the_others_as_they_are(bent):
+    """A screen's red is saturated where its green is not: no white grows out of it."""
+    red, level = np.array([1.0, 0.25, 0.05], np.float32), 1.0
+    image = np.minimum(bent, 0.9)
+    image[100:120, 300:330] = red
+    used, _, _ = use_sheet(captured(image, clip=level))
+    full = used.photo.image >= level
+    assert full[..., 0].sum() > 300 and not full[..., 1:].any()
+    inside = used.photo.image[full[..., 0]]
+    np.testing.assert_allclose(np.median(inside, 0), red, atol=1e-3)
+
+
 @pytest.mark.parametrize("turns", [1, 2, 3])
 def test_a_turned_photo_is_set_upright(image, turns):
     used, _, notices = use_sheet(captured(np.rot90(image, -turns)))
