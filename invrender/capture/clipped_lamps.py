@@ -71,7 +71,9 @@ def raise_clipped(
     x, y = factors.fit(doubt)
     if doubted:  # textures, and a lamp that the screen hides, spoil the table's word
         told = factors.spread(x, y).max() < CLIPPED_LAMPS.plain
-        if not told or abs(y.mean()) >= CLIPPED_LAMPS.likely_gain * doubt:
+        # What is saturated hides how bright it is, not that it is as bright as that.
+        least, most = (CLIPPED_LAMPS.likely_gain * d for d in (-gain_deviation, doubt))
+        if not (told and least < y.mean() < most):
             x, y = factors.fit(0.0)
     factor, gain = np.exp(x), np.exp(y)
     raised = environment + clipped * (factor - 1).astype(np.float32)

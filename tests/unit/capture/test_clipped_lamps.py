@@ -126,7 +126,7 @@ def test_a_hidden_lamp_cannot_make_the_screen_dark():
     """In a JPEG no such lamp is looked for, and light that the screen hides from the table looks
     like a dim screen: the ball's own doubt limits what the table may change."""
     photo, environment, coverage = picture(table_light(hidden_lamp), plain_table, hidden_lamp)
-    for deviation, most in ((0.11, 0.4), (0.14, 0.5)):
+    for deviation, most in ((0.11, 0.4), (0.14, 0.5), (0.43, 0.86)):
         found = raise_clipped(photo, RIG, IMAGE, SCREEN, environment, coverage, deviation)
         assert abs(np.log(found[2]).mean()) < most
 
