@@ -10,7 +10,7 @@ function startViewer(data) {
   const LEVELS = 4;  // of the blurred room beyond the sharp one, as in shade.glsl
   const BLURRED = 128, IRRADIANCE = 32, REFLECTANCE = 64;  // pixels a side
   const TABLE = 0.3;  // albedo of what lies below the horizon of a sphere or cylinder
-  const FRAME = 25;  // ms that a frame may take while something moves: 30 a second, with some to spare
+  const FRAME = 18;  // ms to draw a frame while something moves: 30 a second with the browser's own work
   const EIGHTHS = 8, LEAST = 2;  // of the canvas's pixels a side, in which a slow viewer saves
 
   const canvas = document.getElementById("canvas"), handle = document.getElementById("handle");
