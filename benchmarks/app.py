@@ -17,14 +17,11 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from PIL import Image
-
 from benchmarks.common.app_server import Server
 from benchmarks.common.chromium import CHROMIUM, Page
+from benchmarks.common.jpeg import jpeg
 from benchmarks.common.photos import make_shot
 from benchmarks.common.results import Bar, bar, benchmark_parser, table, write_results
-from invrender.colour import linear_to_srgb
 from invrender.data import EXAMPLE
 from invrender.export import TARGETS, export_maps
 from invrender.files.maps import read_maps
@@ -33,6 +30,7 @@ from invrender.pipeline import refine_capture
 from invrender.types import InputError
 
 SEED = 2999  # of the photo that is uploaded: `benchmarks.capture`'s large one
+QUALITY = 92  # of its JPEG
 ROOT = Path(__file__).parents[1]
 SHAPES = ("plane", "sphere", "cylinder", "cloth")
 SIDE = 512  # pixels of the viewer's canvas
@@ -70,8 +68,7 @@ def inspected(folder: Path, width: int, rounds: int) -> list[float]:
     """Seconds from a file's choice until its annotated picture is there, of several uploads."""
     shot = make_shot(SEED, kind="jpeg", width=width)
     file = folder / "photo.jpg"
-    encoded = linear_to_srgb(np.clip(shot.photo.image, 0, 1)) * 255
-    Image.fromarray(np.round(encoded).astype(np.uint8)).save(file, quality=92)
+    file.write_bytes(jpeg(shot.photo.image, QUALITY))
     server = Server(folder / "uploads")
     page, taken = Page(1280, 900, site=server.site), []
     try:

@@ -39,12 +39,12 @@ from benchmarks.refine import rerender_error
 from invrender.capture.lights import FoundLights, find_lights
 from invrender.capture.sample import Sample
 from invrender.capture.which_pattern import find_pattern
-from invrender.data.simulate_setup import Lamp, draw_lamps, hides, without_screen
+from invrender.data.simulate_setup import draw_lamps, hides, without_screen
 from invrender.files.capture import Capture, load_capture
 from invrender.files.maps import write_maps
 from invrender.files.rig_toml import read_rig, write_rig
 from invrender.files.write import write_exr
-from invrender.lights import NO_PATTERN, Lights
+from invrender.lights import NO_PATTERN, Lamp, Lights
 from invrender.maps import NAMES, Maps, crop_maps, map_errors, resize_maps
 from invrender.pattern.sets import COUNTS, pattern_set
 from invrender.pipeline import Stages, estimate_maps, load_networks

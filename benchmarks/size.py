@@ -24,13 +24,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from benchmarks.common.captures import PHOTOGRAPHS, arguments, make_captures
+from benchmarks.common.jpeg import jpeg
 from benchmarks.common.photos import make_shot
 from benchmarks.common.plot import plot_error_over_time
 from benchmarks.common.results import Bar, bar, table, write_results
-from invrender.colour import linear_to_srgb
 from invrender.files.capture import load_capture
 from invrender.files.maps import read_maps
 from invrender.files.rig_toml import write_rig
@@ -44,7 +43,7 @@ SIZES = (256, 512, 1024, 2048, 4096)
 ONCE = 2048  # pixels a side from which there is one round
 PHOTO = 3840  # pixels wide
 BATCH = 20  # captures
-HUGE = 8000  # pixels wide, of 48 megapixels
+HUGE, QUALITY = 8000, 90  # pixels wide, of 48 megapixels; of its JPEG
 SEED = 2994  # of the large photo
 INVRENDER = ("-m", "invrender")
 EXAMPLE = (*INVRENDER, "refine", "example", "-o", "OUT")
@@ -129,8 +128,7 @@ def huge_photo(folder: Path, width: int) -> Path:
     """A capture whose photo is a JPEG of so many pixels."""
     shot = make_shot(SEED, kind="jpeg", width=width)
     folder.mkdir(parents=True, exist_ok=True)
-    encoded = linear_to_srgb(np.clip(shot.photo.image, 0, 1)) * 255
-    Image.fromarray(np.round(encoded).astype(np.uint8)).save(folder / "photo.jpg", quality=90)
+    (folder / "photo.jpg").write_bytes(jpeg(shot.photo.image, QUALITY))
     write_exr(folder / "pattern.exr", shot.pattern)
     write_rig(folder / "rig.toml", shot.nominal, "pattern.exr")
     return folder

@@ -78,6 +78,8 @@ class Device:
 
 
 IDEAL = Device()
+# A glowing sphere: its centre and radius in metres, its radiance (RGB).
+Lamp = tuple[Vec3, float, Vec3]
 NO_PATTERN: Array = np.zeros((1, 1, 3), np.float32)  # where the rig has no screen
 
 

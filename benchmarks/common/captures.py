@@ -7,7 +7,6 @@ few millimetres and degrees from where ``rig.toml`` says; the camera stands wher
 from __future__ import annotations
 
 import argparse
-import io
 import os
 import tempfile
 from dataclasses import dataclass
@@ -16,10 +15,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
+from benchmarks.common.jpeg import jpeg
 from benchmarks.common.results import benchmark_parser
-from invrender.colour import linear_to_srgb
 from invrender.data.environments import find_environments, procedural_environment, read_environment
 from invrender.data.materials import find_materials, procedural_material, read_material
 from invrender.data.simulate import simulate
@@ -170,10 +168,7 @@ def to_jpeg(folder: Path, quality: int, white: float) -> None:
     """
     photo = read_image(folder / "photo.exr")
     scale = np.float32(1 / white)
-    data = (linear_to_srgb(np.clip(photo * scale, 0, 1)) * 255 + 0.5).astype(np.uint8)
-    with io.BytesIO() as file:
-        Image.fromarray(data).save(file, "JPEG", quality=quality)
-        (folder / "photo.jpg").write_bytes(file.getvalue())
+    (folder / "photo.jpg").write_bytes(jpeg(photo * scale, quality))
     (folder / "photo.exr").unlink()
     room = folder / "truth" / "environment.exr"
     write_exr(room, read_image(room) * scale, half=True)

@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
 
+from benchmarks.common.jpeg import jpeg
 from benchmarks.common.results import benchmark_parser
 from invrender.capture.table import room_irradiance
-from invrender.colour import linear_to_srgb, srgb_to_linear
+from invrender.colour import srgb_to_linear
 from invrender.data.environments import find_environments, procedural_environment, read_environment
 from invrender.data.materials import procedural_material
 from invrender.files.images import Photo
@@ -265,11 +266,8 @@ def sensor(
     quality = int(rng.integers(75, 96))
     if shoulder:
         image = filmic(image, shoulder)
-    data = (linear_to_srgb(image) * 255 + 0.5).astype(np.uint8)
-    with io.BytesIO() as file:
-        Image.fromarray(data).save(file, "JPEG", quality=quality)
-        with Image.open(file) as decoded:
-            data = np.asarray(decoded)
+    with Image.open(io.BytesIO(jpeg(image, quality))) as decoded:
+        data = np.asarray(decoded)
     table = srgb_to_linear(np.arange(256, dtype=np.float32) / 255)
     return Photo(table[data], float(table[250])), f"{text}, JPEG {quality}"
 

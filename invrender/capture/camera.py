@@ -99,9 +99,9 @@ def _border(views: list[View], rig: Rig) -> Array | None:
     for view, (pixels, reach, *_) in zip(views, SQUARE_FIT.passes, strict=True):
         near = pixels * reach if view is views[0] else None
         for _ in range(2):
-            if not _inside(view, _ends(view, _posed(rig, pose))):
-                return None
             ends = _ends(view, _posed(rig, pose))
+            if not _inside(view, ends):
+                return None
             wanted, deviation, seen = _outermost(view, ends, near)
             if seen.sum() < 3:
                 return None

@@ -7,7 +7,7 @@ table's shading is clearly better explained so, one part of the filling is made 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from scipy import optimize
@@ -16,24 +16,23 @@ from invrender.capture.ball_image import screen_coordinates
 from invrender.capture.mirror import Ball
 from invrender.capture.robust import cauchy_residuals, spread
 from invrender.capture.settings import HIDDEN_LAMP, TABLE_METER
-from invrender.capture.table import distant_pairs, hidden_by_screen, lit_table
+from invrender.capture.table import LitTable, distant_pairs, hidden_by_screen
 from invrender.colour import AXES
 from invrender.files.images import Photo
-from invrender.lights import Device
 from invrender.rig import Rig
 from invrender.sphere import directions, sky_flux
 from invrender.types import TINY, Array, Mask
 
 
 def add_hidden_lamp(
-    photo: Photo, rig: Rig, ball: Ball, screen: tuple[Array, Array, Device],
-    environment: Array, coverage: Array,
+    photo: Photo, rig: Rig, ball: Ball, table: Callable[[], LitTable], environment: Array,
+    coverage: Array,
 ) -> tuple[Array, float]:  # fmt: skip
     """The filled environment (H, 2H, 3) with the lamp behind the screen that the table's shading
     shows; and how many times as bright as the filling that is (1 where there is none).
 
-    The screen: pattern (h, w, 3), gain (3,) and display. In a JPEG no lamp is looked for: its
-    colours are too coarse.
+    table: the photo's `lit_table` under the screen and that environment. In a JPEG no lamp is
+    looked for: its colours are too coarse.
     """
     if photo.clip_level is not None:
         return environment, 1.0
@@ -42,7 +41,7 @@ def add_hidden_lamp(
     s, t, _ = screen_coordinates(rig, np.asarray(ball.position), d)
     row, column = (np.clip(np.nan_to_num(a) * parts, 0, parts - 1).astype(int) for a in (t, s))
     part = np.where((coverage <= 0) & (d[..., 2] > 0), row * parts + column, -1)
-    seen, at, use, lit, room = lit_table(photo, rig, ball, screen, environment)
+    seen, at, use, lit, room = table()
     shading = _Shading(seen, use, lit + room)
     best = None
     for k, light in enumerate(_part_lights(rig, at, environment, part)):

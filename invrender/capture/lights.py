@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from invrender.capture.response import Response
 from invrender.capture.screen import Screen, fit_screen
 from invrender.capture.settings import PATTERN_CHECK, SCREEN_FIT, TABLE_LEVEL, UNFOLDING
 from invrender.capture.sheet import FoundSheet, moved_circle, undone, use_paper, use_sheet
+from invrender.capture.table import lit_table
 from invrender.capture.vignetting import find_vignetting, without_vignetting
 from invrender.files.capture import Capture
 from invrender.files.images import Photo
@@ -227,11 +229,14 @@ def _measure(
     lit = capture.pattern, gain, screen.device
     environment = fill_environment(environment, coverage)
     fit["vignetting"] = 0.0
+    table = cache(partial(lit_table, photo, rig, ball, lit, environment))
     if fit["room_raised"] == 1 and screen.saturated <= SCREEN_FIT.saturated:  # the light is known
-        fit["vignetting"] = find_vignetting(photo, rig, ball, lit, environment)
-        photo = without_vignetting(photo, fit["vignetting"])
+        fit["vignetting"] = find_vignetting(photo, rig, table)
+        if fit["vignetting"]:
+            photo = without_vignetting(photo, fit["vignetting"])
+            table = cache(partial(lit_table, photo, rig, ball, lit, environment))
     shown = environment
-    environment, fit["hidden_lamp"] = add_hidden_lamp(photo, rig, ball, lit, shown, coverage)
+    environment, fit["hidden_lamp"] = add_hidden_lamp(photo, rig, ball, table, shown, coverage)
     if fit["hidden_lamp"] > 1:
         lamps = environment - shown
     size = min(PATTERN_CHECK.captured_size, max(capture.pattern.shape[:2]))

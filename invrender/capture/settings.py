@@ -189,9 +189,8 @@ class SquareFit:
     whole: float = 10.0  # ratio; by hand
     nominal: float = 12.0  # ratio to the median, from which the rig's own square is seen; by hand
     better: float = 1.8  # sum of four logarithms, from which another square is the one; by hand
-    clearer: float = (
-        0.5  # the same of the border from outside, where the rig's own is seen; by hand
-    )
+    # The same of the border from outside, where the rig's own square is seen; by hand.
+    clearer: float = 0.5
     least_side: int = 32  # pixels of a side that can be seen; by hand
     least_move: float = 0.004  # sides; a smaller one is not believed; by hand
     found_tilt: float = 0.3  # degrees, expected error of the tilt by the square; by hand

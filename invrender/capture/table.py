@@ -15,10 +15,13 @@ from invrender.sampling import resize_pattern
 from invrender.sphere import resample_environment, sky_flux
 from invrender.types import Array, Mask
 
+# Log radiance, points, which blocks those are, and irradiance from screen and room.
+LitTable = tuple[Array, Array, Mask, Array, Array]
+
 
 def lit_table(
     photo: Photo, rig: Rig, ball: Ball, screen: tuple[Array, Array, Device], environment: Array
-) -> tuple[Array, Array, Mask, Array, Array]:
+) -> LitTable:
     """The blocks that show the table: log radiance (n, 3), points (n, 3), which those are (h, w),
     and their irradiance (n, 3) from the screen (pattern, gain, display), and from the filled
     environment."""

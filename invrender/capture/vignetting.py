@@ -7,31 +7,28 @@ the cause: a factor 1/(1 + c·r²)², with r = 1 in the corners, as the fourth p
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
-from invrender.capture.mirror import Ball
 from invrender.capture.robust import spread
 from invrender.capture.settings import TABLE_METER, VIGNETTING
-from invrender.capture.table import distant_pairs, lit_table
+from invrender.capture.table import LitTable, distant_pairs
 from invrender.files.images import Photo
-from invrender.lights import Device
 from invrender.rig import Rig
 from invrender.types import TINY, Array
 
 
-def find_vignetting(
-    photo: Photo, rig: Rig, ball: Ball, screen: tuple[Array, Array, Device], environment: Array
-) -> float:
+def find_vignetting(photo: Photo, rig: Rig, table: Callable[[], LitTable]) -> float:
     """The share of light that the photo's corners lack; 0 where the table does not show it.
 
-    The screen: pattern (h, w, 3), gain (3,) and display; environment: (H, 2H, 3), filled.
-    Logarithms of the table's radiance some blocks apart are compared, as in
-    `invrender.capture.clipped_lamps`, in brightness. The table is believed where that explains
-    nearly all of its shading, and much more than without.
+    table: the photo's `lit_table` under the screen and the filled environment. Logarithms of the
+    table's radiance some blocks apart are compared, as in `invrender.capture.clipped_lamps`, in
+    brightness. The table is believed where that explains nearly all of its shading, and much more
+    than without.
     """
-    seen, at, use, lit, room = lit_table(photo, rig, ball, screen, environment)
+    seen, at, use, lit, room = table()
     pairs = [pair for pair, _ in distant_pairs(use)]
     if not pairs:
         return 0.0

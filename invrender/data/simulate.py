@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 
 from invrender.data.simulate_camera import developed, seen, to_jpeg
-from invrender.data.simulate_setup import Lamp, Setup
+from invrender.data.simulate_setup import Setup
 from invrender.files.maps import write_maps
 from invrender.files.rig_toml import FOUND_IN_PHOTO, write_rig
 from invrender.files.write import write_exr
-from invrender.lights import IDEAL, Device
+from invrender.lights import IDEAL, Device, Lamp
 from invrender.maps import Maps
 from invrender.render.height import displaced as relief_of
 from invrender.rig import Rig, fov_of

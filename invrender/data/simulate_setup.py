@@ -14,11 +14,10 @@ import numpy as np
 
 from invrender.data.simulate_camera import HALF_WIDTH, Camera
 from invrender.data.tablets import find_tablet
-from invrender.lights import IDEAL, Device
+from invrender.lights import IDEAL, Device, Lamp
 from invrender.rig import Rig, fov_of
 from invrender.types import Array, InputError, Vec3
 
-Lamp = tuple[Vec3, float, Vec3]  # as `invrender.render.path_traced` has it
 PHOTO_KINDS = ("raw", "bracket", "jpeg")
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from invrender.lights import IDEAL, Device, Lights
+from invrender.lights import IDEAL, Device, Lamp, Lights
 from invrender.maps import Maps
 from invrender.render import brdf
 from invrender.render.backend import BACKEND, dr
@@ -28,8 +28,6 @@ SAMPLE_LIFT = 1e-4
 UP = np.array([0, 0, 1], np.float32)
 # With a lamp: of the spp, the samples of the ball's window, which reaches so many of its radii.
 LAMP_FACTOR, BALL_WINDOW = 16, 1.3
-# A glowing sphere: its centre and radius in metres, its radiance (RGB).
-Lamp = tuple[Vec3, float, Vec3]
 
 
 class CookTorrance(mi.BSDF):

@@ -1,6 +1,7 @@
 """Lamps that are clipped, or hidden by the screen, are as bright as the table's shading says."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from invrender.capture.clipped_lamps import raise_clipped
 from invrender.capture.environment import fill_environment, unfold_environment
 from invrender.capture.hidden_lamp import add_hidden_lamp
 from invrender.capture.mirror import make_ball
-from invrender.capture.table import hidden_by_screen, room_irradiance
+from invrender.capture.table import hidden_by_screen, lit_table, room_irradiance
 from invrender.files.images import Photo
 from invrender.lights import IDEAL
 from invrender.rig import Rig
@@ -139,11 +140,16 @@ def test_nothing_clipped_nothing_raised(light):
         assert found[3] is None
 
 
+def with_hidden_lamp(photo, filled, coverage):
+    table = partial(lit_table, photo, RIG, BALL, SCREEN, filled)
+    return add_hidden_lamp(photo, RIG, BALL, table, filled, coverage)
+
+
 def test_the_table_tells_of_a_lamp_behind_the_screen():
     photo, environment, coverage = picture(table_light(hidden_lamp), plain_table, hidden_lamp)
     photo = replace(photo, clip_level=None)
     filled = fill_environment(environment, coverage)
-    found, times = add_hidden_lamp(photo, RIG, BALL, SCREEN, filled, coverage)
+    found, times = with_hidden_lamp(photo, filled, coverage)
     assert times > 20
     np.testing.assert_array_equal(found[coverage > 0], environment[coverage > 0])
     truth = hidden_lamp(directions(64, 128).astype(float))
@@ -161,7 +167,7 @@ def test_no_lamp_behind_the_screen_where_there_is_none(light, albedo):
     filled = fill_environment(environment, coverage)
     whole = replace(photo, clip_level=None)
     for some in (whole, photo, replace(whole, image=0 * photo.image)):
-        found, times = add_hidden_lamp(some, RIG, BALL, SCREEN, filled, coverage)
+        found, times = with_hidden_lamp(some, filled, coverage)
         assert found is filled and times == 1
 
 
