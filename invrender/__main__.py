@@ -1,5 +1,3 @@
-import sys
+from invrender.cli.main import run
 
-from invrender.cli.main import main
-
-sys.exit(main())
+run()

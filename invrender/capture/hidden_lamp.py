@@ -7,7 +7,7 @@ table's shading is clearly better explained so, one part of the filling is made 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 from scipy import optimize
@@ -61,15 +61,15 @@ def add_hidden_lamp(
     return np.asarray(environment * factor, np.float32), float(np.exp(x).mean())
 
 
-def _part_lights(rig: Rig, at: Array, environment: Array, part: Array) -> Iterator[Array]:
-    """Irradiance (n, 3) of points on the table from each part of the room, in turn."""
+def _part_lights(rig: Rig, at: Array, environment: Array, part: Array) -> Array:
+    """Irradiance (parts, n, 3) of points on the table from each part of the room."""
     d, flux = sky_flux(environment)
     label = part[: len(part) // 2].ravel()
     behind = np.flatnonzero(label >= 0)
     seen = ~hidden_by_screen(rig, at, d[behind])
-    for k in range(HIDDEN_LAMP.parts**2):
-        own = label[behind] == k
-        yield seen[:, own] @ flux[behind[own]]
+    own = np.zeros((HIDDEN_LAMP.parts**2, len(behind), 3))
+    own[label[behind], np.arange(len(behind))] = flux[behind]
+    return np.tensordot(own, seen.astype(float), (1, 1)).swapaxes(1, 2)
 
 
 class _Shading:

@@ -92,20 +92,16 @@ def hidden_by_screen(rig: Rig, points: Array, direction: Array) -> Mask:
     if not rig.has_screen:
         return np.zeros((len(points), len(direction)), bool)
     corner, (e_x, e_y) = rig.screen_body
-    normal = np.cross(e_x, e_y)
-    from_corner = np.asarray(points) - corner
-    out = np.empty((len(from_corner), len(direction)), bool)
-    step = max(1, TABLE_METER.at_once // max(len(direction), 1))
-
-    def along(axis: Array, part: Array, t: Array) -> Array:
-        return np.asarray((part @ axis)[:, None] + t * (direction @ axis)) / (axis @ axis)
-
-    with np.errstate(divide="ignore", invalid="ignore"):
-        for i in range(0, len(out), step):
-            part = from_corner[i : i + step]
-            t = -(part @ normal)[:, None] / (direction @ normal)
-            a, b = along(e_x, part, t), along(e_y, part, t)
-            out[i : i + step] = (t > 0) & (a >= 0) & (a <= 1) & (b >= 0) & (b <= 1)
+    corners = corner + np.array([0 * e_x, e_x, e_x + e_y, e_y])
+    way = corners - np.asarray(points)[:, None]
+    # What it hides lies inside all four planes through the point and one of its sides.
+    inward = np.cross(way, np.roll(way, -1, axis=1))
+    inward *= np.sign(np.einsum("nij,nj->ni", inward, way.mean(1)))[..., None]
+    inward, d = inward.astype(np.float32), np.asarray(direction, np.float32).T
+    out = np.empty((len(way), d.shape[1]), bool)
+    step = max(1, TABLE_METER.at_once // max(4 * d.shape[1], 1))
+    for i in range(0, len(out), step):
+        out[i : i + step] = (inward[i : i + step] @ d).min(1) > 0
     return out
 
 

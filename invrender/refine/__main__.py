@@ -2,6 +2,6 @@
 
 import sys
 
-from invrender.cli.main import main
+from invrender.cli.main import run
 
-sys.exit(main(["refine", *sys.argv[1:]]))
+run("refine", *sys.argv[1:])

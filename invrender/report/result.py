@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from invrender.maps import NAMES, Estimate, Maps
 from invrender.report.report import Report
 from invrender.types import Array, InputError
 
-SAMPLES = 256  # of the specular lobe in the rendering that is kept
+SAMPLES = 256  # of the specular lobe in a rendering
 # What is a number in `Report.capture_fit` but of the ball, not of the lights' fit.
 _BALL = ("ball_radius", "ball_confidence")
 PATTERNS = "shown", "captured"
@@ -109,6 +110,11 @@ class Result:
         elif screen is None:
             screen = lights.shown * np.asarray(lights.gain, np.float32)
         width = lights.rig.sample_size
+        beside = ThreadPoolExecutor(1)
+        page = beside.submit(
+            report_html, self.report, maps, sigma, lights.environment, screen, photo, rendering
+        )
+        beside.shutdown(wait=False)
         write_maps(folder, maps, width=width)
         for key, image in sigma.items():
             write_exr(folder / f"sigma_{key}.exr", image, data=True, width=width)
@@ -130,8 +136,7 @@ class Result:
         # Grey where they agree; a tenth of white away from black or white.
         difference = srgb_to_linear(0.5 + 5 * (rendering - photo) / white)
         write_png(folder / "difference.png", difference)
-        page = report_html(self.report, maps, sigma, lights.environment, screen, photo, rendering)
-        (folder / "report.html").write_text(page, encoding="utf-8")
+        (folder / "report.html").write_text(page.result(), encoding="utf-8")
         (folder / "report.json").write_text(
             json.dumps(self.report.to_dict(), indent=2) + "\n", encoding="utf-8"
         )
