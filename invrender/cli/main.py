@@ -27,13 +27,7 @@ def run(*argv: str) -> NoReturn:
     At once: taking PyTorch and LLVM apart takes 0.4 s, in which nothing is done for anybody
     (`python -m benchmarks size`).
     """
-    code = 1
-    try:
-        code = main(argv or None)
-    except SystemExit as end:  # argparse's
-        code = end.code if isinstance(end.code, int) else 1
-    except BaseException as error:
-        sys.excepthook(type(error), error, error.__traceback__)
+    code = main(argv or None)
     with suppress(OSError):
         sys.stdout.flush()
         sys.stderr.flush()

@@ -36,8 +36,8 @@ LISTED = "; import sys; print(sorted({m.split('.')[0] for m in sys.modules}))"
     "code",
     [
         "import invrender" + LISTED,
-        "from contextlib import suppress; from invrender.cli.main import main\n"
-        "with suppress(SystemExit): main(['--help'])\n" + LISTED.removeprefix("; "),
+        "import atexit, sys\n"
+        "atexit.register(lambda: print(sorted({m.split('.')[0] for m in sys.modules})))\n" + HELP,
     ],
     ids=["import", "help"],
 )
