@@ -19,6 +19,7 @@ from invrender.refine.posterior import explain
 from invrender.refine.priors import Prior, lobe_prior, pooled
 from invrender.refine.several import explain_together, likeliest, plain_prior
 from invrender.refine.shared import light_doubt, share
+from invrender.refine.texture import without_light
 from invrender.refine.theta import to_maps
 from invrender.render.near import renderer_under
 from invrender.types import Array, Mask
@@ -92,7 +93,8 @@ def explain_photos(
     if known.interrupted:
         result = Refined(to_maps(known.prior.mean), known.prior.expected, interrupted=True)
     else:
-        result = explain(known.observations, known.prior, samples=samples)
+        prior = without_light(known.observations, known.prior, samples=samples)
+        result = explain(known.observations, prior, samples=samples)
         result.converged &= known.converged
     result.factors = known.factors
     return result, list(known.observations)

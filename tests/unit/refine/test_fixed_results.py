@@ -29,6 +29,7 @@ from invrender.refine.priors import lobe_prior, network_prior, pooled
 from invrender.refine.registration import register
 from invrender.refine.several import explain_together, likeliest
 from invrender.refine.shared import share
+from invrender.refine.texture import TEXTURE, without_light
 from invrender.refine.theta import N, R, deviations, to_maps, to_theta
 from invrender.render.fast.estimator import Fast
 from invrender.rig import Rig
@@ -165,12 +166,17 @@ def checked():
     }
 
 
+def light():
+    return of_prior(without_light([shot()], prior(), s=replace(TEXTURE, least_part=0.3)))
+
+
 def mixed():
     return of_refined(explain([shot()], prior()))
 
 
 CASES = {
-    f.__name__: f for f in (shared, mixed, pixels, lobes, mirrors, checked, together, registered)
+    f.__name__: f
+    for f in (shared, light, mixed, pixels, lobes, mirrors, checked, together, registered)
 }
 
 
