@@ -44,7 +44,7 @@ class Settings:
     shared_error: float = 0.5  # of a network's squared error that a material shares
 
 
-TEXTURE = Settings()
+TEXTURE_SETTINGS = Settings()
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Measured:
 
 
 def without_light(
-    observations: Sequence[Observation], prior: Prior, *, samples: int = 64, s: Settings = TEXTURE
+    observations: Sequence[Observation], prior: Prior, *, samples: int = 64, s: Settings = TEXTURE_SETTINGS
 ) -> Prior:
     """The prior, of maps that explain the photos, with the roughness that the light's pattern in
     the albedo tells, and the albedo that it leaves."""
@@ -68,8 +68,8 @@ def without_light(
     found = [measure_light(o, prior.mean, weight, samples, s) for o in observations]
     precisions = [1 / (s.times**2 * m.variance + s.doubt**2) for m in found]
     left = 1 / (1 + s.roughness**2 * sum(precisions))  # of the expected variance
-    delta = sum(m.delta * p for m, p in zip(found, precisions, strict=True))
-    delta = np.float32(delta * left * s.roughness**2)
+    weighted = sum(m.delta * p for m, p in zip(found, precisions, strict=True))
+    delta = np.float32(weighted * left * s.roughness**2)
     light = resize(np.mean([m.light for m in found], 0), *weight.shape)
     theta, total = prior.mean.copy(), prior.expected.copy()
     theta[..., R] += delta * weight
@@ -79,7 +79,7 @@ def without_light(
 
 
 def measure_light(
-    o: Observation, theta: Array, weight: Array, samples: int = 64, s: Settings = TEXTURE
+    o: Observation, theta: Array, weight: Array, samples: int = 64, s: Settings = TEXTURE_SETTINGS
 ) -> Measured:
     """What a photo tells of maps θ (H, W, 9), whose pixels count by their weight (H, W)."""
     at = np.ix_(*(centres(min(s.side, n), n) for n in weight.shape))

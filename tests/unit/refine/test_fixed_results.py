@@ -29,7 +29,7 @@ from invrender.refine.priors import lobe_prior, network_prior, pooled
 from invrender.refine.registration import register
 from invrender.refine.several import explain_together, likeliest
 from invrender.refine.shared import share
-from invrender.refine.texture import TEXTURE, without_light
+from invrender.refine.texture import TEXTURE_SETTINGS, without_light
 from invrender.refine.theta import N, R, deviations, to_maps, to_theta
 from invrender.render.fast.estimator import Fast
 from invrender.rig import Rig
@@ -167,7 +167,7 @@ def checked():
 
 
 def light():
-    return of_prior(without_light([shot()], prior(), s=replace(TEXTURE, least_part=0.3)))
+    return of_prior(without_light([shot()], prior(), s=replace(TEXTURE_SETTINGS, least_part=0.3)))
 
 
 def mixed():
