@@ -57,7 +57,11 @@ class Measured:
 
 
 def without_light(
-    observations: Sequence[Observation], prior: Prior, *, samples: int = 64, s: Settings = TEXTURE_SETTINGS
+    observations: Sequence[Observation],
+    prior: Prior,
+    *,
+    samples: int = 64,
+    s: Settings = TEXTURE_SETTINGS,
 ) -> Prior:
     """The prior, of maps that explain the photos, with the roughness that the light's pattern in
     the albedo tells, and the albedo that it leaves."""
