@@ -37,6 +37,11 @@ CURVE_TEXT = (
     "the photo has a tone curve, as phones give it to a JPEG; it was undone by what the ball shows "
     "of the pattern: a raw photo needs no such guess"
 )
+USUAL_CURVE_TEXT = (
+    "so much of the screen is saturated in the ball that the photo's tone curve cannot be told; one "
+    "as cameras have on average was undone, which leaves bright over dark light uncertain by "
+    "{:.0%}: take a raw photo, or a bracket"
+)
 
 
 @dataclass(frozen=True)
@@ -102,7 +107,9 @@ def find_lights(
             found = measure_reflectance(seen.photo, seen.rig, found)
             capture, mirror = use_reflectance(seen, found)
             lights, _ = _measure(capture, found)
-            mirror = (*mirror, Notice("photo-curve", CURVE_TEXT))
+            usual = USUAL_CURVE_TEXT.format(response.deviation)
+            text = CURVE_TEXT if response.measured else usual
+            mirror = (*mirror, Notice("photo-curve", text))
             sheet = undone(sheet, response)
         lights, paper = use_paper(sheet, lights, found)
         photo = without_vignetting(capture.photo, lights.fit["vignetting"])

@@ -21,10 +21,13 @@ class Response:
     v·exp(c(log v)).
 
     c is linear between `invrender.files.tone_curves.KNOTS`, has the given ``logarithms`` there, and
-    is constant beyond. The same for all channels.
+    is constant beyond. The same for all channels. ``deviation``: what undoing it leaves, of the
+    logarithm of bright over dark light. ``measured``: by the photo; else as cameras' curves are.
     """
 
     logarithms: tuple[float, ...]
+    deviation: float = 0.0
+    measured: bool = True
 
     def apply(self, light: Array) -> tuple[Array, Array]:
         """Values (...) that the file has for light (...); and how steep the curve is there, in
@@ -63,7 +66,9 @@ class Response:
         image = np.concatenate(
             [linear(part) for part in np.array_split(photo.image, TONE_CURVE.parts)]
         )
-        return replace(photo, image=image, clip_level=level, linear=True)
+        return replace(
+            photo, image=image, clip_level=level, linear=True, curve_deviation=self.deviation
+        )
 
 
 def curve_shares(values: Array) -> Array:

@@ -71,8 +71,8 @@ def fit_screen(
     Gain and blur are fitted first, for the screen as it should be, a ``device`` that is known among
     that. Where that fits worse than to
     `SCREEN_FIT.poor`, or the screen is saturated, its pose and the display's curve are fitted too;
-    where more than `SCREEN_FIT.no_curve` is saturated the curve cannot be told from the gain and is
-    taken as straight. Then what the errors ask for: the display's other properties, and an 8-bit
+    where more than `SCREEN_FIT.no_curve` is saturated the curve cannot be told from the gain, and a
+    camera's is taken as it usually is. Then what the errors ask for: the display's other properties, and an 8-bit
     file's tone curve, unless the photo is linear. Raises `InputError` if the ball cannot show the
     screen, or shows it saturated or dark.
     """
@@ -83,6 +83,8 @@ def fit_screen(
     ideal = fit.result(u)
     if ideal.residual < SCREEN_FIT.poor and ideal.saturated < SCREEN_FIT.saturated:
         return ideal
+    fit.hidden = fit.curved_file and ideal.saturated >= SCREEN_FIT.no_curve
+    ideal = fit.result(u)
     fit.free[:_COLOUR] = True
     fit.free[_GAMMA] = ideal.saturated < SCREEN_FIT.no_display
     if ideal.saturated >= SCREEN_FIT.no_curve:
@@ -184,7 +186,7 @@ class _Fit:
         self.free[_GAIN], self.free[_BLUR] = True, True
         self.free[_COLOUR] = self.coded = photo.clip_level is not None
         self.curved_file = self.coded and not photo.linear
-        self.asked, self.undone = False, photo.curve_deviation
+        self.asked, self.hidden, self.undone = False, False, photo.curve_deviation
         ball = image.ball
         self.step = step = max(1, round(ball.radius / SCREEN_FIT.finest))
         self.radius = ball.radius / step
@@ -641,7 +643,7 @@ class _Fit:
             rig=self.moved(u),
             device=device,
             gain=gain,
-            response=Response(tuple(u[_CURVE].tolist())) if self.free[_CURVE].any() else None,
+            response=self.response(u, covariance),
             blur=math.exp(u[_BLUR]) * self.step,
             residual=residual,
             ideal_residual=residual,
@@ -675,15 +677,35 @@ class _Fit:
         by[_GAIN] = 1 / 3
         log = np.log(self.pattern) * np.exp(u[_GAMMA])
         by[_GAMMA] = (shown * log).mean((0, 1)) / shown.mean((0, 1)) / 3
-        # Of the light over the sample's, which is so much darker than white.
-        sample = DISPLAY.sample * np.exp(u[_GAIN]).mean(keepdims=True) * self.reflectance.mean()
-        by[_CURVE] = -curve_shares(sample)[0]
-        variance = by @ covariance @ by
-        fitted = float(np.sqrt(variance)) * SCREEN_FIT.correlated
-        # Straight, or as cameras' curves are: that could not be asked where much is saturated.
-        curve = 0.0
-        if self.curved_file and not self.asked:
-            white = np.exp(u[_GAIN]).mean(keepdims=True) * self.reflectance.mean()
-            span = curve_shares(white) - curve_shares(sample)
-            curve = float(span[0] @ self.prior_mean[_CURVE])
-        return math.hypot(fitted, curve, self.undone)
+        span = self.curve_span(u)
+        by[_CURVE] = span
+        fitted = float(np.sqrt(by @ covariance @ by)) * SCREEN_FIT.correlated
+        unknown = 0.0
+        if self.hidden:
+            unknown = self.usual_deviation(span)
+        elif self.curved_file and not self.asked:  # straight, or as cameras' curves are
+            unknown = float(span @ self.prior_mean[_CURVE])
+        return math.hypot(fitted, unknown, self.undone)
+
+    def curve_span(self, u: Array) -> Array:
+        """What each knot of a tone curve adds to the logarithm of the screen's light over the
+        sample's, which is so much darker."""
+        white = np.exp(u[_GAIN]).mean(keepdims=True) * self.reflectance.mean()
+        return curve_shares(white)[0] - curve_shares(DISPLAY.sample * white)[0]
+
+    def usual_deviation(self, span: Array) -> float:
+        """That of cameras' curves about their mean, of what ``span`` adds up."""
+        return math.sqrt(float(span @ np.linalg.inv(self.prior[_CURVE, _CURVE]) @ span))
+
+    def response(self, u: Array, covariance: Array) -> Response | None:
+        """The file's tone curve: as fitted; as cameras' curves are, where it could not be asked
+        since much is saturated; None where it is straight."""
+        span = self.curve_span(u)
+        if self.free[_CURVE].any():
+            variance = span @ covariance[_CURVE, _CURVE] @ span
+            fitted = SCREEN_FIT.correlated * math.sqrt(float(variance))
+            return Response(tuple(u[_CURVE].tolist()), fitted)
+        if not self.hidden:
+            return None
+        usual = tuple(self.prior_mean[_CURVE].tolist())
+        return Response(usual, self.usual_deviation(span), measured=False)

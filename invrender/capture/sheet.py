@@ -21,7 +21,7 @@ from invrender.capture.ball_image import sample_image
 from invrender.capture.camera import is_whole
 from invrender.capture.mirror import Ball
 from invrender.capture.response import Response
-from invrender.capture.settings import GAUSSIAN_SPREAD, SCREEN_FIT, SHEET_FIT
+from invrender.capture.settings import CLIPPED_LAMPS, GAUSSIAN_SPREAD, SCREEN_FIT, SHEET_FIT
 from invrender.capture.sheet_layout import (
     FAMILY,
     MODULES,
@@ -581,45 +581,64 @@ def undone(sheet: FoundSheet | None, response: Response) -> FoundSheet | None:
     return replace(sheet, white_radiance=radiance)
 
 
-def screen_gain(found: FoundSheet, lights: Lights) -> tuple[Array, float] | None:
-    """The screen's gain (3,) by the light on the paper, and the deviation of its logarithm.
+@dataclass(frozen=True)
+class PaperLight:
+    """The light that the paper shows: the screen's ``gain`` (3,), and factors on what the ball
+    shows of the room and, (3,), on what is guessed of it. ``deviation``: of the logarithm of the
+    gain's mean."""
 
-    The paper shows screen and room together. ``lights`` has the pattern, and the room up to a
-    factor, which is fitted too: a wrong reflectance of the ball does not matter. So is what the
-    lens loses towards the corners. None where too
-    little paper is to be seen. The paper's own reflectance is the most of the deviation.
+    gain: Array
+    room: float
+    lamps: Array
+    deviation: float
+
+
+def light_on_paper(found: FoundSheet, lights: Lights, doubt: float = math.inf) -> PaperLight | None:
+    """The most probable screen and room by the light on the paper, which shows both together.
+
+    ``lights`` has the pattern, the gain by the ball, of which ``doubt`` is the logarithm's
+    deviation (infinite: it is not asked), and the room, whose ``lamps`` are a guess. A factor on
+    each, what the lens loses towards the corners and the paper's own reflectance are fitted
+    together, under log-normal priors. None where too little paper is to be seen.
     """
     if len(found.white) < SHEET_FIT.least_patches:
         return None
     cells = SHEET_FIT.screen_cells
-    lit = lights.pattern, 1.0, lights.device
-    screen = screen_irradiance(lights.rig, found.white, lit, cells)
-    environment = resample_environment(lights.environment, SHEET_FIT.environment_rows)
-    room = room_irradiance(lights.rig, found.white, environment)
+    guessed = np.zeros_like(lights.environment) if lights.lamps is None else lights.lamps
+    given = np.maximum(np.broadcast_to(np.asarray(lights.gain, float), 3), TINY)
+    screen = screen_irradiance(lights.rig, found.white, (lights.pattern, given, lights.device), cells)
+    rows = SHEET_FIT.environment_rows
+    room, lamps = (
+        room_irradiance(lights.rig, found.white, resample_environment(light, rows))
+        for light in (lights.environment - guessed, guessed)
+    )
     seen = found.white_radiance * (math.pi / PAPER)
     weight = 1 / (SHEET_FIT.patch_noise * np.maximum(seen, TINY))
-    # Unknowns: the three gains over the lights' own, the room's factor, and vignetting.
-    given = np.maximum(np.broadcast_to(np.asarray(lights.gain, float), 3), TINY)
+    channels = min(SCREEN_FIT.white_deviation, doubt)
 
+    # Unknowns: logarithms of the screen's factors, the room's, the lamps' and the paper's;
+    # vignetting.
     def errors(x: Array) -> Array:
-        bright = screen * given * x[:3] + x[3] * room
-        lens = lens_gain(min(x[4], SHEET_FIT.most_vignetting), found.white_aside)
-        off = (bright / lens[:, None] - seen) * weight
-        white = np.log(np.maximum(given * x[:3], TINY))
+        bright = screen * np.exp(x[:3]) + room * np.exp(x[3]) + lamps * np.exp(x[4:7])
+        lens = lens_gain(min(x[8], SHEET_FIT.most_vignetting), found.white_aside)
+        off = (bright * np.exp(x[7]) / lens[:, None] - seen) * weight
         prior = (
-            *((white - white.mean()) / SCREEN_FIT.white_deviation),
-            (x[3] - 1) / SHEET_FIT.room_deviation,
-            x[4] / SHEET_FIT.vignetting_deviation,
+            x[:3].mean() / doubt,
+            *((x[:3] - x[:3].mean()) / channels),
+            x[3] / SHEET_FIT.room_deviation,
+            x[4:7].mean() / CLIPPED_LAMPS.deviation,
+            *((x[4:7] - x[4:7].mean()) / CLIPPED_LAMPS.channel_deviation),
+            x[7] / (PAPER_DEVIATION / PAPER),
+            x[8] / SHEET_FIT.vignetting_deviation,
         )
         return np.append(off.ravel(), prior)
 
-    done = least_squares(errors, np.array([1.0, 1, 1, 1, 0]), loss="soft_l1")
+    done = least_squares(errors, np.zeros(9), loss="soft_l1")
     covariance = np.linalg.pinv(done.jac.T @ done.jac)
-    gain = given * done.x[:3]
-    if not np.all(gain > 0):
-        return None
-    fitted = float(np.sqrt(np.diag(covariance)[:3].max()) / done.x[:3].min())
-    return gain, math.hypot(fitted, PAPER_DEVIATION / PAPER)
+    factors = np.exp(done.x)
+    return PaperLight(
+        given * factors[:3], float(factors[3]), factors[4:7], float(np.sqrt(covariance[:3, :3].mean()))
+    )
 
 
 def use_paper(
@@ -642,32 +661,42 @@ def use_paper(
             f"{1 / ratio:.0%} of its size (the line in its window tells) or [ball] radius is wrong"
         )
         notices.append(Notice("sheet-scale", text))
-    measured = screen_gain(sheet, lights) if lights.rig.has_screen else None
-    if measured is None:
+    free = light_on_paper(sheet, lights) if lights.rig.has_screen else None
+    if free is None:
         return lights, tuple(notices)
-    gain, deviation = measured
-    off = float(np.mean(gain) / np.mean(lights.gain))
-    fit = {**lights.fit, "paper_gain": off, "paper_gain_deviation": deviation}
+    off = float(np.mean(free.gain) / np.mean(lights.gain))
+    fit = {**lights.fit, "paper_gain": off, "paper_gain_deviation": free.deviation}
     doubt = fit.get("gain_deviation", 0.0)
-    agree = abs(math.log(off)) <= SHEET_FIT.gains_differ * math.hypot(deviation, doubt)
-    if agree and doubt > 0:  # both tell something: by their variances
-        share = doubt**2 / (doubt**2 + deviation**2)
-        ball_gain = np.asarray(lights.gain, float)
-        gain = ball_gain * (gain / ball_gain) ** share
-        lights = replace(lights, gain=gain.astype(np.float32))
-        fit["gain_deviation"] = math.sqrt(share) * deviation
-    if fit.get("saturated", 0) > SCREEN_FIT.saturated and deviation < SHEET_FIT.useful:
+    agree = abs(math.log(off)) <= SHEET_FIT.gains_differ * math.hypot(free.deviation, doubt)
+    saturated = fit.get("saturated", 0) > SCREEN_FIT.saturated
+    both = light_on_paper(sheet, lights, doubt) if agree and doubt > 0 else free
+    assert both is not None
+    by_paper = saturated and both.deviation < SHEET_FIT.useful
+    if by_paper or (agree and doubt > 0):
+        lights = _with_light(lights, both)
+        fit["gain_deviation"] = both.deviation
+        fit["room_raised"] = fit.get("room_raised", 1.0) * float(both.lamps.mean())
+    if by_paper:
         text = (
             f"{fit['saturated']:.0%} of the screen is saturated in the ball; its radiance was "
-            f"taken from the capture sheet's paper, to within {deviation:.0%}"
+            f"taken from the capture sheet's paper, to within {both.deviation:.0%}"
         )
         notices.append(Notice("gain-by-paper", text))
         fit["gain_by_paper"] = 1.0
-        return replace(lights, gain=gain.astype(np.float32), fit=fit), tuple(notices)
-    if not agree:
+    elif not agree:
         text = (
             f"the light on the capture sheet's paper is {off:.2f} times what the ball's image of "
             "the screen explains: check [ball] reflectance, and that the paper is plain and white"
         )
         notices.append(Notice("paper-contradicts-ball", text))
     return replace(lights, fit=fit), tuple(notices)
+
+
+def _with_light(lights: Lights, paper: PaperLight) -> Lights:
+    """The lights as bright as the paper shows them."""
+    gain = paper.gain.astype(np.float32)
+    if lights.lamps is None:
+        return replace(lights, gain=gain)
+    lamps = lights.lamps * paper.lamps.astype(np.float32)
+    room = (lights.environment - lights.lamps) * np.float32(paper.room) + lamps
+    return replace(lights, gain=gain, environment=room, lamps=lamps)

@@ -156,6 +156,26 @@ def test_a_tone_curve_is_undone(shoulder):
         assert straight.clip_level > photo.clip_level
 
 
+def test_where_much_is_saturated_a_curve_is_taken_as_cameras_have_it():
+    """A quarter of the screen and more hides how the curve ends; a linear file has none."""
+    pattern, rig = noise_pattern(), replace(RIG, ball_radius=0.02)
+    image = 2 * photograph(rig, *SIZE, pattern=pattern, gain=GAIN, samples=3)
+    encoded = np.round(linear_to_srgb(np.clip(image * 1.8 / (1 + 0.8 * image), 0, 1)) * 255) / 255
+    photo = Photo(srgb_to_linear(encoded).astype(np.float32), 0.97)
+    shown = trace_image(rig, make_ball(rig, rig.ball_centre, rig.ball_radius, SIZE))
+    found = screen.fit_screen(photo, rig, shown, pattern)
+    assert found.saturated > SCREEN_FIT.no_curve and found.response and not found.response.measured
+    straight = found.response.undo(photo)
+    dark, bright = values = np.array([KNOTS[FIXED], KNOTS[-1]], np.float32)
+    light = values / (1.8 - 0.8 * values)
+    undone = found.response.undo(Photo(values[None, :, None])).image[0, :, 0]
+    off = np.log([bright / dark, undone[1] / undone[0]]) - np.log(light[1] / light[0])
+    assert abs(off[1]) < 0.3 * abs(off[0])
+    assert found.gain_deviation > straight.curve_deviation > 0.1
+    again = screen.fit_screen(straight, rig, shown, pattern)
+    assert again.response is None and again.gain_deviation > straight.curve_deviation
+
+
 def test_a_ball_moved_by_nothing_changes_nothing(hard):
     """The fit settles: no chain of undamped steps amplifies the last digits."""
     x, y, z = BALL.position

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from sheet_photo import sheet_photo
+from sheet_photo import irradiance, sheet_photo
 
 from invrender.capture.lights import find_lights
 from invrender.capture.mirror import make_ball
@@ -15,11 +15,12 @@ from invrender.capture.sheet import (
     _fit,
     _from_homography,
     moved_circle,
-    screen_gain,
+    light_on_paper,
     use_paper,
     use_sheet,
 )
 from invrender.capture.sheet_layout import capture_sheet
+from invrender.capture.table import room_irradiance, screen_irradiance
 from invrender.files.capture import Capture
 from invrender.files.images import Photo
 from invrender.lights import Lights
@@ -229,8 +230,11 @@ def test_the_paper_tells_the_screens_gain(image):
     assert len(found.white) > 40 and found.white_radiance.shape == found.white.shape
     for factor in (1.0, 0.4):
         lights = Lights(used.rig, default_pattern(64), gain=factor * np.array(GAIN))
-        gain, deviation = screen_gain(found, lights)
-        assert gain == pytest.approx(GAIN, rel=0.05) and 0.06 < deviation < 0.1
+        light = light_on_paper(found, lights)
+        assert light.gain == pytest.approx(GAIN, rel=0.05) and 0.06 < light.deviation < 0.1
+    # A gain that the ball shows well is kept: the paper may reflect a little more or less.
+    sure = light_on_paper(found, replace(lights, gain=0.96 * np.array(GAIN)), 0.005)
+    assert sure.gain == pytest.approx(0.96 * np.array(GAIN), rel=0.01) and sure.deviation < 0.006
 
 
 def test_saturated_paper_does_not_count(image):
@@ -252,6 +256,27 @@ def test_the_paper_stands_in_for_a_saturated_ball_and_contradicts_a_wrong_one(im
     assert [n.code for n in notices] == ["sheet-scale", "paper-contradicts-ball"]
     assert "94%" in notices[0].text
     assert use_paper(None, dim, ball) == (dim, ())
+
+
+def test_the_paper_tells_how_bright_guessed_lamps_are():
+    """Lamps that a photo clips were made twenty times too bright, the screen half as bright."""
+    used, found, _ = use_sheet(captured(sheet_photo(RIG, *SIZE, gain=GAIN, room=0.8)))
+    ball = make_ball(used.rig, used.rig.ball_centre, RIG.ball_radius, SIZE)
+    room = np.full((16, 32, 3), 20 * 0.8, np.float32)
+    fit = {"saturated": 0.8, "gain_deviation": 0.3, "room_raised": 20.0}
+    wrong = Lights(used.rig, default_pattern(64), room, 0.5 * np.array(GAIN), fit=fit, lamps=room)
+    lights, notices = use_paper(found, wrong, ball)
+    at = found.white[len(found.white) // 2][None]
+
+    def light(gain, room):
+        lit = lights.pattern, np.asarray(gain), lights.device
+        return screen_irradiance(used.rig, at, lit, 24) + room_irradiance(used.rig, at, room)
+
+    assert light(lights.gain, lights.environment) == pytest.approx(
+        irradiance(used.rig, at, GAIN, 0.8), rel=0.08
+    )
+    assert lights.fit["room_raised"] < 3 and np.array_equal(lights.lamps, lights.environment)
+    assert [n.code for n in notices] == ["gain-by-paper"]
 
 
 def test_known_lights_take_the_camera_of_the_sheet(image):
