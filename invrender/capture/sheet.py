@@ -606,7 +606,9 @@ def light_on_paper(found: FoundSheet, lights: Lights, doubt: float = math.inf) -
     cells = SHEET_FIT.screen_cells
     guessed = np.zeros_like(lights.environment) if lights.lamps is None else lights.lamps
     given = np.maximum(np.broadcast_to(np.asarray(lights.gain, float), 3), TINY)
-    screen = screen_irradiance(lights.rig, found.white, (lights.pattern, given, lights.device), cells)
+    screen = screen_irradiance(
+        lights.rig, found.white, (lights.pattern, given, lights.device), cells
+    )
     rows = SHEET_FIT.environment_rows
     room, lamps = (
         room_irradiance(lights.rig, found.white, resample_environment(light, rows))
@@ -637,7 +639,10 @@ def light_on_paper(found: FoundSheet, lights: Lights, doubt: float = math.inf) -
     covariance = np.linalg.pinv(done.jac.T @ done.jac)
     factors = np.exp(done.x)
     return PaperLight(
-        given * factors[:3], float(factors[3]), factors[4:7], float(np.sqrt(covariance[:3, :3].mean()))
+        given * factors[:3],
+        float(factors[3]),
+        factors[4:7],
+        float(np.sqrt(covariance[:3, :3].mean())),
     )
 
 

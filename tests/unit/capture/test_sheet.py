@@ -14,8 +14,8 @@ from invrender.capture.sheet import (
     _Camera,
     _fit,
     _from_homography,
-    moved_circle,
     light_on_paper,
+    moved_circle,
     use_paper,
     use_sheet,
 )
