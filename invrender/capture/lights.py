@@ -38,9 +38,9 @@ CURVE_TEXT = (
     "of the pattern: a raw photo needs no such guess"
 )
 USUAL_CURVE_TEXT = (
-    "so much of the screen is saturated in the ball that the photo's tone curve cannot be told; one "
-    "as cameras have on average was undone, which leaves bright over dark light uncertain by "
-    "{:.0%}: take a raw photo, or a bracket"
+    "too much of the screen is saturated in the ball to tell the photo's tone curve; one as cameras "
+    "have on average was undone, which leaves bright over dark light uncertain by {:.0%}: take a "
+    "raw photo, or a bracket"
 )
 
 

@@ -72,9 +72,9 @@ def fit_screen(
     that. Where that fits worse than to
     `SCREEN_FIT.poor`, or the screen is saturated, its pose and the display's curve are fitted too;
     where more than `SCREEN_FIT.no_curve` is saturated the curve cannot be told from the gain, and a
-    camera's is taken as it usually is. Then what the errors ask for: the display's other properties, and an 8-bit
-    file's tone curve, unless the photo is linear. Raises `InputError` if the ball cannot show the
-    screen, or shows it saturated or dark.
+    camera's is taken as it usually is. Then what the errors ask for: the display's other
+    properties, and an 8-bit file's tone curve, unless the photo is linear. Raises `InputError` if
+    the ball cannot show the screen, or shows it saturated or dark.
     """
     fit = _Fit(photo, rig, image, pattern, device)
     u = fit.start()
