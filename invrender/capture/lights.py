@@ -38,8 +38,8 @@ CURVE_TEXT = (
     "of the pattern: a raw photo needs no such guess"
 )
 USUAL_CURVE_TEXT = (
-    "too much of the screen is saturated in the ball to tell the photo's tone curve; one as cameras "
-    "have on average was undone, which leaves bright over dark light uncertain by {:.0%}: take a "
+    "too much of the screen is saturated in the ball to tell the photo's tone curve; one as cameras"
+    " have on average was undone, which leaves bright over dark light uncertain by {:.0%}: take a "
     "raw photo, or a bracket"
 )
 
