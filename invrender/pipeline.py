@@ -173,7 +173,7 @@ def _reconstruct(
     start, refined, photos = estimate_maps(crops, stage, init, samples, networks)
     with stage("render"):
         renderer = photos[0].renderer
-        result = summarise(found, crops[0], start, refined, renderer, init, samples)
+        result = summarise(found, crops, start, refined, renderer, init, samples)
     result.report.seconds = stage.seconds
     return result
 
@@ -185,9 +185,11 @@ def estimate_maps(
     samples: int = 64,
     networks: Networks | None = None,
 ) -> tuple[Maps, Refined, list[Observation]]:
-    """Initial and refined maps, and the photos with their forward models in the first one's frame.
+    """Initial and refined maps, and the photos with their forward models in the frame of the first
+    one that is not left out.
 
-    networks: of `load_networks`, which are loaded where there are none.
+    networks: of `load_networks`, which are loaded where there are none. Raises `InputError` where
+    the photos are of different samples.
     """
     with stage("read"):
         networks = networks or load_networks(init)
@@ -199,6 +201,7 @@ def estimate_maps(
             observe,
             plain_start,
         )
+        from invrender.refine.same_sample import strangers
 
     own, free = crops, len(crops) > 1 and any(c.place is None for c in crops)
     if free:
@@ -206,6 +209,11 @@ def estimate_maps(
             crops = place_samples(own)
     with stage("forward model"):
         photos = [observe(c.photo, c.lights, c.clipped) for c in crops]
+    if free:
+        with stage("registration"):
+            odd = strangers(photos)
+        if odd:
+            return _without(odd, own, stage, init, samples, networks)
     measured = len(photos) >= MEASURING_PHOTOS
     if measured and not any(c.lights.rig.has_screen for c in crops):
         with stage("initial maps"):
@@ -223,13 +231,25 @@ def estimate_maps(
             photos, initial, samples, stage.part("refine"),
             lambda i, e: stage.progress(f"refine: step {i}, photo error {e:.4f}"),
         )  # fmt: skip
-    kept = [i for i in range(len(own)) if i not in refined.left_out]
-    if free and refined.left_out and kept[0] == 0 and not refined.interrupted:
+    if free and refined.left_out and not refined.interrupted:
         # What does not belong to the sample has spoilt the others' places too.
-        start, again, photos = estimate_maps([own[i] for i in kept], stage, init, samples, networks)
-        again.left_out = sorted([*refined.left_out, *(kept[i] for i in again.left_out)])
-        return start, again, photos
+        return _without(refined.left_out, own, stage, init, samples, networks)
     return initial.maps, refined, photos
+
+
+def _without(
+    odd: Sequence[int],
+    own: Sequence[Sample],
+    stage: Stages,
+    init: str,
+    samples: int,
+    networks: Networks | None,
+) -> tuple[Maps, Refined, list[Observation]]:
+    """`estimate_maps` of the photos that are not left out."""
+    kept = [i for i in range(len(own)) if i not in odd]
+    start, refined, photos = estimate_maps([own[i] for i in kept], stage, init, samples, networks)
+    refined.left_out = sorted([*odd, *(kept[i] for i in refined.left_out)])
+    return start, refined, photos
 
 
 def _ask_networks(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,32 @@ def read_captures(folder: Path) -> list[Shown]:
     return [(load_capture(folder), [])]
 
 
+@dataclass(frozen=True)
+class Seen:
+    """What one photo of several shows: the capture, the number of its pattern in the set, from
+    nought, if it is one's; and its lights, or why it is left out."""
+
+    capture: Capture
+    pattern: int | None
+    found: FoundLights | None
+    error: InputError | None = None
+
+
+def see_each(captures: Sequence[Shown], known: dict[str, Any]) -> Iterator[Seen]:
+    """The lights of each capture of several, one after another. known: of `find_lights`."""
+    for i, (capture, patterns) in enumerate(captures):
+        which = None
+        try:
+            twin = next((c for c, _ in captures[:i] if _same(c, capture)), None)
+            if twin is not None:
+                raise InputError(f"it is the same photo as {twin.name}")
+            if patterns:
+                capture, which = find_pattern(capture, patterns)
+            yield Seen(capture, which, find_lights(capture, **known))
+        except InputError as error:
+            yield Seen(capture, which, None, error)
+
+
 def find_every_light(
     captures: Sequence[Shown],
     known: dict[str, Any],
@@ -39,19 +65,17 @@ def find_every_light(
     found: list[FoundLights] = []
     problems: list[InputError] = []
     notices = []
-    for i, (capture, patterns) in enumerate(captures):
-        try:
-            twin = next((c for c, _ in captures[:i] if _same(c, capture)), None)
-            if twin is not None:
-                raise InputError(f"it is the same photo as {twin.name}")
-            if patterns:
-                capture, which = find_pattern(capture, patterns)
-                text = f"{capture.name} shows pattern {which + 1} of the set"
-                notices.append(Notice("pattern-of-set", text))
-            found.append(find_lights(capture, **known))
-        except InputError as error:
-            problems.append(error)
-            notices.append(Notice("photo-left-out", f"{capture.name} was left out: {error}"))
+    for i, seen in enumerate(see_each(captures, known)):
+        name = seen.capture.name
+        if seen.pattern is not None:
+            notices.append(
+                Notice("pattern-of-set", f"{name} shows pattern {seen.pattern + 1} of the set")
+            )
+        if seen.error is not None:
+            problems.append(seen.error)
+            notices.append(Notice("photo-left-out", f"{name} was left out: {seen.error}"))
+        if seen.found is not None:
+            found.append(seen.found)
         progress((i + 1) / len(captures))
     if not found:
         raise problems[0]

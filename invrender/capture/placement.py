@@ -76,11 +76,11 @@ def find_turn(image: Array, first: Array, s: PlacementSettings = PLACEMENT) -> f
 
     image, first: (N, N, 3) crops of the square. Nought where no turn is clearly better.
     """
-    here, there = _features(image, s), _features(first, s)
+    here, there = features(image, s), features(first, s)
     window = (_circle(len(image), s),) * 2
     step = 360 / s.angles
     angles = step * np.arange(s.angles)
-    scores = [_best_shift(_turned(here, a), there, window, s)[0] for a in angles]
+    scores = [best_shift(_turned(here, a), there, window, s)[0] for a in angles]
     best, score = float(angles[int(np.argmax(scores))]), max(scores)
     straight = max(scores[k] for k in (-1, 0, 1))
     if score < max(straight + s.clearly, s.least):
@@ -88,7 +88,7 @@ def find_turn(image: Array, first: Array, s: PlacementSettings = PLACEMENT) -> f
     for finer in s.finer:
         tried = [best - finer, best, best + finer]
         best = tried[
-            int(np.argmax([_best_shift(_turned(here, a), there, window, s)[0] for a in tried]))
+            int(np.argmax([best_shift(_turned(here, a), there, window, s)[0] for a in tried]))
         ]
     return (best + 180) % 360 - 180
 
@@ -99,11 +99,11 @@ def find_shift(
     """Shift (x right, y up) in halves of the side by which ``image`` shows what ``first`` does, and
     the correlation; no shift where nothing belongs together. seen: which pixels of both count."""
     windows = seen[0].astype(np.float32), seen[1].astype(np.float32)
-    score, shift = _best_shift(_features(image, s), _features(first, s), windows, s)
+    score, shift = best_shift(features(image, s), features(first, s), windows, s)
     return (shift if score >= s.least else np.zeros(2)), score
 
 
-def _features(image: Array, s: PlacementSettings) -> Array:
+def features(image: Array, s: PlacementSettings) -> Array:
     """Texture and relief (2, N, N), each of about unit spread."""
     unit = len(image) / 2
     mean = float(image.mean()) + TINY
@@ -135,7 +135,7 @@ def _turned(features: Array, degrees: float) -> Array:
     )
 
 
-def _best_shift(
+def best_shift(
     here: Array, there: Array, windows: tuple[Array, Array], s: PlacementSettings
 ) -> tuple[float, Array]:
     """The greatest correlation, less what a far shift costs, and the shift."""

@@ -136,8 +136,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 def _inspect_set(args: argparse.Namespace, console: Console) -> int:
     """What each photo of a set shows, a line each; what is left out, and why."""
-    from invrender.capture.lights import find_lights
-    from invrender.capture.which_pattern import find_pattern
+    from invrender.capture.photos import see_each
     from invrender.files.capture import load_set
     from invrender.files.write import atomic_path
     from invrender.report.inspection import annotate, summary
@@ -147,22 +146,17 @@ def _inspect_set(args: argparse.Namespace, console: Console) -> int:
         raise InputError("--ball is for one photo: inspect that one by itself")
     captures, patterns = load_set(args.capture)
     photos: dict[str, Any] = {}
-    for capture in captures:
-        name = capture.name.split("/")[-1]
-        try:
-            which = None
-            if patterns:
-                capture, which = find_pattern(capture, patterns)
-            found = find_lights(capture)
-        except InputError as error:
-            photos[name] = {"left_out": str(error)}
+    for seen in see_each([(c, patterns) for c in captures], {}):
+        name = seen.capture.name.split("/")[-1]
+        if seen.found is None:
+            photos[name] = {"left_out": str(seen.error)}
             continue
-        shown = {} if which is None else {"pattern": which + 1}
-        photos[name] = {**shown, **summary(found)}
+        shown = {} if seen.pattern is None else {"pattern": seen.pattern + 1}
+        photos[name] = {**shown, **summary(seen.found)}
         if args.out is not None:
             args.out.mkdir(parents=True, exist_ok=True)
             with atomic_path(args.out / f"inspect_{name}.png") as path:
-                annotate(found).save(path, format="PNG", compress_level=1)
+                annotate(seen.found).save(path, format="PNG", compress_level=1)
     if args.json:
         print(json.dumps(photos))
     for name, told in photos.items() if not args.json else ():

@@ -17,7 +17,7 @@ from invrender.files.images import read_image
 from invrender.files.maps import read_maps, write_maps
 from invrender.files.rig_toml import read_rig, write_rig
 from invrender.files.write import write_exr, write_png
-from invrender.lights import IDEAL, NO_PATTERN, Device, Lights
+from invrender.lights import IDEAL, NO_PATTERN, Device, Lights, NearLamp
 from invrender.maps import NAMES, Estimate, Maps
 from invrender.report.report import Report
 from invrender.types import Array, InputError
@@ -26,7 +26,8 @@ SAMPLES = 256  # of the specular lobe in a rendering
 # What is a number in `Report.capture_fit` but of the ball, not of the lights' fit.
 _BALL = ("ball_radius", "ball_confidence")
 PATTERNS = "shown", "captured"
-MAY_LACK = ("coverage.exr", *(f"pattern_{k}.exr" for k in PATTERNS))
+LAMP_FILES = "near_lamp.exr", "near_lamp.json"  # its share of the environment; where it is
+MAY_LACK = ("coverage.exr", *LAMP_FILES, *(f"pattern_{k}.exr" for k in PATTERNS))
 
 
 @dataclass(frozen=True)
@@ -129,6 +130,10 @@ class Result:
             write_exr(folder / "pattern_captured.exr", screen)
         if lights.coverage is not None:
             write_exr(folder / "coverage.exr", lights.coverage)
+        if lights.near is not None:
+            write_exr(folder / LAMP_FILES[0], lights.near.share, data=True)
+            where = {k: list(getattr(lights.near, k)) for k in ("place", "seen_from")}
+            (folder / LAMP_FILES[1]).write_text(json.dumps(where) + "\n", encoding="utf-8")
         write_exr(folder / "sample.exr", photo, width=width)
         white = max(float(np.percentile(photo, 99.5)), 1e-12)
         write_png(folder / "photo.png", photo / white)
@@ -168,5 +173,20 @@ class Result:
             captured,
             {k: v for k, v in fit.items() if k not in _BALL and isinstance(v, float)},
             told.device or IDEAL,
+            near=_read_near_lamp(folder),
         )
         return cls(Estimate(maps, sigma), lights, read_image(folder / "sample.exr"), report)
+
+
+def _read_near_lamp(folder: Path) -> NearLamp | None:
+    image, where = (folder / name for name in LAMP_FILES)
+    if not image.exists():
+        return None
+    try:
+        told = json.loads(where.read_text(encoding="utf-8"))
+        place, seen = (np.array(told[k], float) for k in ("place", "seen_from"))
+        if place.shape != (3,) or seen.shape != (3,) or not np.isfinite([place, seen]).all():
+            raise ValueError
+    except (OSError, ValueError, KeyError, TypeError):
+        raise InputError(f"{where} is missing or damaged; run 'invrender refine' again") from None
+    return NearLamp(tuple(place.tolist()), tuple(seen.tolist()), read_image(image)[..., 0])

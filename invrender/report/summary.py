@@ -27,22 +27,25 @@ PACKAGES = ("invrender", "drjit", "mitsuba", "numpy")
 
 def summarise(
     found: Sequence[FoundLights],
-    first: Sample,
+    crops: Sequence[Sample],
     start: Maps,
     refined: Refined,
     renderer: Renderer,
     init: str,
     samples: int,
 ) -> Result:
-    """The result of all captures that were found, in the first one's frame and under its lights.
+    """The result of all captures that were found, in the frame and under the lights of the first one
+    that was not left out.
 
-    first: the first sample, which ``renderer`` renders. start: the initial maps. samples: of the
+    crops: the sample in each; ``renderer`` renders that first one's. start: the initial maps. samples: of the
     specular lobe, where only the error matters. The report's seconds are left to the caller.
     """
     from invrender.refine.checks import baked_light, coarse_error, photo_error
     from invrender.refine.theta import deviations
 
-    lights, capture, size = found[0].lights, found[0].capture, len(first.photo)
+    k = next(i for i in range(len(found)) if i not in refined.left_out)
+    first, lights, capture = crops[k], found[k].lights, found[k].capture
+    size = len(first.photo)
     # The second is kept; of the first, and of many pixels, only the error matters.
     counts = ((start, samples), (refined.maps, 2 * samples if size <= FINE else samples))
     pictures = [renderer.render(maps, count) for maps, count in counts]
@@ -75,7 +78,7 @@ def summarise(
         photo_error={"initial": before, "refined": after},
         converged=refined.converged,
         history=refined.history,
-        capture_fit=_capture_fit(found[0]),
+        capture_fit=_capture_fit(found[k]),
         warnings=[*found[0].notices, *notices],
         notes=list(capture.photo.notes),
         map_error=errors,

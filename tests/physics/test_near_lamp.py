@@ -8,11 +8,14 @@ import pytest
 from invrender.data.materials import procedural_material
 from invrender.data.simulate_setup import without_screen
 from invrender.lights import NO_PATTERN, Lights, NearLamp
+from invrender.maps import NAMES, Estimate
 from invrender.refine.gauss_newton import linearise
 from invrender.refine.theta import to_theta
 from invrender.render.fast.estimator import Fast
 from invrender.render.near import renderer_under
 from invrender.render.path_traced import path_traced, sample_scene
+from invrender.report.report import Report
+from invrender.report.result import Result
 from invrender.rig import Rig
 from invrender.sphere import directions
 
@@ -93,3 +96,21 @@ def test_it_moves_with_the_lights(maps):
         turned = [c * before[0] + s * before[1], c * before[1] - s * before[0], before[2]]
         np.testing.assert_allclose(after, turned, atol=1e-6)
     assert moved.near.share.sum() == pytest.approx(lights.near.share.sum(), rel=1e-4)
+
+
+def test_a_saved_result_keeps_it(maps, tmp_path):
+    lights = lights_with(PLACE)
+    sigma = {name: np.full((SIZE, SIZE), 0.01, np.float32) for name in NAMES}
+    fit = {"gain": [0, 0, 0]}
+    error = {"initial": 0.1, "refined": 0.1}
+    report = Report("done", "c", SIZE, "flat", 0.09, {"refine": 1.0}, error, True, [], fit, [], None, {"invrender": "1"})
+    photo = np.full((SIZE, SIZE, 3), 0.1, np.float32)
+    result = Result(Estimate(maps, sigma), lights, photo, report)
+    result.save(tmp_path)
+    again = Result.load(tmp_path)
+    far = result.render(replace(lights, near=None), samples=64)
+    near, kept = (r.render(samples=64) for r in (result, again))
+    np.testing.assert_allclose(kept, near, rtol=1e-3, atol=1e-4)
+    assert np.abs(far - near).max() > 0.1 * near.max()
+    replace(result, lights=replace(lights, near=None)).save(tmp_path)
+    assert Result.load(tmp_path).lights.near is None  # an older result's lamp is gone
