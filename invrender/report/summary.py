@@ -34,11 +34,11 @@ def summarise(
     init: str,
     samples: int,
 ) -> Result:
-    """The result of all captures that were found, in the frame and under the lights of the first one
-    that was not left out.
+    """The result of all captures that were found, in the frame and under the lights of the first
+    one that was not left out.
 
-    crops: the sample in each; ``renderer`` renders that first one's. start: the initial maps. samples: of the
-    specular lobe, where only the error matters. The report's seconds are left to the caller.
+    crops: the sample in each; ``renderer`` is that first one's. start: the initial maps. samples:
+    of the specular lobe, where only the error matters. The report's seconds are left to the caller.
     """
     from invrender.refine.checks import baked_light, coarse_error, photo_error
     from invrender.refine.theta import deviations

@@ -103,7 +103,21 @@ def test_a_saved_result_keeps_it(maps, tmp_path):
     sigma = {name: np.full((SIZE, SIZE), 0.01, np.float32) for name in NAMES}
     fit = {"gain": [0, 0, 0]}
     error = {"initial": 0.1, "refined": 0.1}
-    report = Report("done", "c", SIZE, "flat", 0.09, {"refine": 1.0}, error, True, [], fit, [], None, {"invrender": "1"})
+    report = Report(
+        "done",
+        "c",
+        SIZE,
+        "flat",
+        0.09,
+        {"refine": 1.0},
+        error,
+        True,
+        [],
+        fit,
+        [],
+        None,
+        {"invrender": "1"},
+    )
     photo = np.full((SIZE, SIZE, 3), 0.1, np.float32)
     result = Result(Estimate(maps, sigma), lights, photo, report)
     result.save(tmp_path)
