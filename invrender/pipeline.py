@@ -15,6 +15,7 @@ import numpy as np
 
 from invrender.capture.lights import FoundLights
 from invrender.capture.photos import find_every_light, read_captures, without_photo
+from invrender.capture.same_sample import strangers
 from invrender.capture.sample import Sample, place_samples
 from invrender.files.capture import check_count
 from invrender.files.output import check_output
@@ -201,7 +202,7 @@ def estimate_maps(
             observe,
             plain_start,
         )
-        from invrender.refine.same_sample import strangers
+        from invrender.refine.flat import plain_image
 
     own, free = crops, len(crops) > 1 and any(c.place is None for c in crops)
     if free:
@@ -211,7 +212,8 @@ def estimate_maps(
         photos = [observe(c.photo, c.lights, c.clipped) for c in crops]
     if free:
         with stage("registration"):
-            odd = strangers(photos)
+            shown = [p.photo for p in photos]
+            odd = strangers(shown, lambda i: plain_image(shown[i], photos[i].renderer))
         if odd:
             return _without(odd, own, stage, init, samples, networks)
     measured = len(photos) >= MEASURING_PHOTOS

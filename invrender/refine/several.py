@@ -142,7 +142,7 @@ def _calibrate(
     photos = dict(enumerate(map(Photo.of, observations)))
     while True:
         problem = _small(list(photos.values()), theta, s.roughness, samples, s)
-        point, _ = problem.solve(problem.mean, s.tried)
+        point, _ = problem.search(problem.mean, s.tried)
         scatter = noise_of(point.misfit, s)
         excess = [
             own / max(float(np.median(np.delete(scatter, i))), 1e-6) if len(photos) > 2 else 0.0

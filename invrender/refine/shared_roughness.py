@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
+from invrender.refine.flat import PLAIN_ROUGHNESS
 from invrender.refine.groups import group
 from invrender.refine.theta import D, R, S
 from invrender.types import Array
 
-TRIED_ROUGHNESS = np.array([0.12, 0.22, 0.33, 0.45, 0.57, 0.69, 0.8, 0.92], np.float32)  # by hand
+TRIED_ROUGHNESS = np.array(PLAIN_ROUGHNESS, np.float32)
 
 
 @dataclass(frozen=True)
