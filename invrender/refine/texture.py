@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from invrender.refine.checks import baked_light
 from invrender.refine.gauss_newton import Observation, linearise
 from invrender.refine.priors import Prior
 from invrender.refine.theta import D, N, R, S, project
@@ -41,7 +40,6 @@ class Settings:
     roughness: float = 0.05  # deviation of δ that is expected
     doubt: float = 0.02  # of what is measured of it: lights, relief
     times: float = 3.0  # by which its own error exceeds what the texture tells
-    wrong_lights: float = 0.6  # of `baked_light`: then not the roughness is wrong
     dielectric_f0: tuple[float, float] = (0.08, 0.15)  # surely dielectric; no longer one
     shared_error: float = 0.5  # of a network's squared error that a material shares
 
@@ -69,9 +67,7 @@ def without_light(
     the albedo tells, and the albedo that it leaves."""
     low, high = s.dielectric_f0
     weight = np.clip((high - prior.mean[..., S].mean(-1)) / (high - low), 0, 1)
-    if weight.mean() < s.least_part or any(
-        baked_light(prior.mean[..., D], o.renderer, samples) > s.wrong_lights for o in observations
-    ):
+    if weight.mean() < s.least_part:
         return prior
     found = [measure_light(o, prior.mean, weight, samples, s) for o in observations]
     precisions = [1 / (s.times**2 * m.variance + s.doubt**2) for m in found]
