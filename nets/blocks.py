@@ -12,6 +12,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+GRID_WINDOW = 16  # pixels a side over which a grid is averaged; by hand
+GRID_MOST = 0.02  # amplitude; grids were at most 0.012, what is greater is the picture's own
+
 
 class Pointwise(nn.Module):
     """1×1 convolution as a matrix product over channels-last memory, where torch's is slower."""
@@ -147,6 +150,34 @@ class Decoder(nn.Module):
         for up, level, skip in zip(self.up, self.levels, reversed(skips), strict=True):
             x = level(up(x) + skip)
         return self.ending(x)
+
+
+def without_grid(images: Tensor) -> Tensor:
+    """Images (B, C, H, W) without the grid of two pixels that `Upsample` leaves in them.
+
+    Its four interleaved outputs have errors of their own (Odena et al. 2016, "Deconvolution and
+    checkerboard artifacts"). What alternates along rows, along columns, and along both is averaged
+    over `GRID_WINDOW` pixels and taken away; single lines and edges stay.
+    """
+    h, w = images.shape[2:]
+    step = GRID_WINDOW // 2
+    around = (step // 2 + 1, step // 2 + 1 + -w % step, step // 2 + 1, step // 2 + 1 + -h % step)
+    # Reflected, what alternates goes on alternating. An image too small for that has no grid.
+    if min(h, w) <= max(around):
+        return images
+    x = F.pad(images.reshape(-1, 1, h, w), around, mode="reflect")
+    mean, change = (torch.tensor(k, dtype=x.dtype) / 4 for k in ([1, 2, 1], [-1, 2, -1]))
+    kernels = [torch.outer(a, b) for a, b in ((change, mean), (mean, change), (change, change))]
+    x = F.conv2d(x, torch.stack(kernels)[:, None]).clamp(-GRID_MOST, GRID_MOST)
+    row, column = (1 - 2.0 * (torch.arange(n) % 2) for n in x.shape[2:])
+    sign = torch.stack(
+        [row[:, None].expand(x.shape[2:]), column.expand(x.shape[2:]), torch.outer(row, column)]
+    )
+    amplitude = F.avg_pool2d(x * sign, GRID_WINDOW, step)
+    amplitude = F.interpolate(amplitude, scale_factor=step, mode="bilinear")
+    start = step // 2
+    grid = (amplitude[..., :h, :w] * sign[:, start : start + h, start : start + w]).sum(1)
+    return images - grid.reshape(images.shape)
 
 
 def channels_last_cat(parts: Sequence[Tensor]) -> Tensor:

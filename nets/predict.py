@@ -22,6 +22,7 @@ from invrender.render.scene import scene_under
 from invrender.sampling import resize
 from invrender.types import Array, InputError
 from nets.batch import Batch, batch_of, lobe_input, positions
+from nets.blocks import without_grid
 from nets.clues import light_inputs, white_level
 from nets.model import LEAST_LEVEL, MAPS, MAX_PHOTO
 from nets.scales import COARSE, WHOLE, Prediction, enlarged, fitting, shaded, shrunk
@@ -89,9 +90,10 @@ class Reconstructor:
 
 @torch.inference_mode()
 def predict(network: torch.nn.Module, batch: Batch) -> Batch:
-    """A network's output for a batch."""
+    """A network's output for a batch, its maps `without_grid`."""
     out: Batch = network(batch)
-    return out
+    plain = {k: without_grid(out[k]) for k in MAPS}
+    return out | plain | {k: plain[k].clamp(0, 1) for k in MAPS if k != "normal"}
 
 
 class Corrector:

@@ -114,7 +114,7 @@ def read_photo(path: Path) -> Photo:
     One of more than `WHOLE_PIXELS` is averaged down, light by light. Raises `InputError` as
     `read_image` does, and for a photo with pixels that are missing, transparent or not square.
 
-    >>> from invrender.cli.main import EXAMPLE
+    >>> from invrender.data import EXAMPLE
     >>> photo = read_photo(EXAMPLE / "photo.exr")
     >>> photo.image.shape, photo.notes
     ((720, 960, 3), ())
