@@ -71,6 +71,10 @@ def find_ball(
             circle = _climb_measured(view, rig, circle, *settings)
         return circle
 
+    def worth_fitting(circle: Array) -> bool:
+        mirror, _ = _with_reflectance(view, rig, circle)
+        return _confidence(view, mirror, circle) > BALL_SEARCH.worth_fitting
+
     def circles() -> Iterator[Array]:
         best = finer(climbed[0])
         yield best
@@ -82,8 +86,9 @@ def find_ball(
         yield best * [1, 1, larger]
         # A speckled table has many places that look likelier at first.
         if max(b.confidence for b in balls) < BALL_SEARCH.least_confidence:
-            yield from map(finer, climbed[2:])
-            yield from map(finer, _search(photo, rig, BALL_SEARCH.kept)[1])
+            yield from filter(worth_fitting, map(finer, climbed[2:]))
+            more = _search(photo, rig, BALL_SEARCH.kept)[1]
+            yield from filter(worth_fitting, map(finer, more))
 
     balls: list[Ball] = []
     for circle in circles():

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -129,7 +130,7 @@ def read_photo(path: Path) -> Photo:
     if clip is not None and raster.encoding.convert is None:
         matrix = raster.encoding.matrix
         raster.encoding = replace(raster.encoding, matrix=None)
-    image = decode(raster, reduction=reduction)
+    image = decode(raster, reduction=reduction, saturated=math.inf if clip is None else clip)
     _check_finite(path, raster, image)
     if clip is None or raster.encoding.matrix is not None or raster.encoding.convert is not None:
         np.maximum(image, 0, out=image)

@@ -175,12 +175,16 @@ def oriented(data: NDArray[Any], orientation: int) -> NDArray[Any]:
     return data
 
 
-def decode(raster: Raster, *, data: bool = False, reduction: int = 1) -> Array:
+def decode(
+    raster: Raster, *, data: bool = False, reduction: int = 1, saturated: float = math.inf
+) -> Array:
     """Upright linear Rec. 709 (H, W, 3) float32 of a raster, row by row.
 
     data: the values stand for themselves (roughness, normals), no curve, no matrix. reduction:
     each pixel is the mean, of light, over so many by so many; what is left over at the right and
-    the lower border is dropped. Alpha is divided out where it is a factor.
+    the lower border is dropped. A mean of which a part is at ``saturated`` or above says only that
+    there was at least so much light, and is no less than that. Alpha is divided out where it is a
+    factor.
     """
     stored = oriented(raster.data, raster.orientation)
     alpha = raster.alpha if raster.premultiplied and not data else None
@@ -208,10 +212,14 @@ def decode(raster: Raster, *, data: bool = False, reduction: int = 1) -> Array:
         if reduction > 1:
             # By strides: numpy's mean over two of five axes takes three times as long.
             target[:] = 0
+            full = np.zeros(target.shape, bool)
             for k in range(reduction * reduction):
                 row, column = divmod(k, reduction)
-                target += light[row::reduction, column : width * reduction : reduction]
+                part_of = light[row::reduction, column : width * reduction : reduction]
+                target += part_of
+                full |= part_of >= saturated
             target /= reduction * reduction
+            target[full] = np.maximum(target[full], np.float32(saturated))
     return image
 
 

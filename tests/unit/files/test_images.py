@@ -259,6 +259,19 @@ def test_photos_of_many_megapixels_are_averaged_down(tmp_path, monkeypatch):
     assert read_image(tmp_path / "a.png").shape == (43, 61, 3)
 
 
+def test_a_mean_over_a_saturated_pixel_counts_as_saturated(tmp_path, monkeypatch):
+    """Channel by channel; the mean of dark and white would pass for a measured grey."""
+    monkeypatch.setattr(images, "WHOLE_PIXELS", 400)
+    codes = np.full((40, 60, 3), 50, np.uint8)
+    codes[7, 10, 1] = 255
+    Image.fromarray(codes).save(tmp_path / "a.png")
+    photo = read_photo(tmp_path / "a.png")
+    assert photo.clip_level is not None and photo.image.shape == (13, 20, 3)
+    full = photo.image >= photo.clip_level
+    assert np.argwhere(full).tolist() == [[2, 3, 1]]
+    np.testing.assert_allclose(photo.image[~full], srgb_to_linear(50 / 255), rtol=1e-5)
+
+
 def test_a_jpeg_beyond_memory_is_decoded_smaller(tmp_path, monkeypatch):
     monkeypatch.setattr(raster, "MAX_MEMORY", 64 * 48)
     monkeypatch.setattr(pillow, "MAX_MEMORY", 64 * 48)
