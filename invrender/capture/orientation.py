@@ -161,6 +161,8 @@ def find_either_ball(
         return capture, find_ball(photo, rig, manual, tilt_deviation)
     found: list[tuple[float, Rig, Ball]] = []
     problem: InputError | None = None
+    # The capture sheet measures the ball: taken for the other shape it is some 6% off.
+    weight = BALL_SHAPE.radius_weights[capture.fov_from == "sheet"]
     for shape in BALL_SHAPES:
         shaped = replace(rig, ball_shape=shape)
         try:
@@ -168,7 +170,7 @@ def find_either_ball(
         except InputError as error:
             problem = problem or error
             continue
-        score = ball.confidence - abs(ball.radius_m / rig.ball_radius - 1)
+        score = ball.confidence - weight * abs(ball.radius_m / rig.ball_radius - 1)
         found.append((score, shaped, ball))
         if score > BALL_SHAPE.certain:
             break

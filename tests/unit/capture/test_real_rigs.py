@@ -1,11 +1,13 @@
 """Rigs as people have them: balls of steel, full spheres, no field of view, cropped photos."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from synthetic_photo import blocks, grey_table, photograph, textured_table
 
+from invrender.capture import orientation
 from invrender.capture.ball import find_ball, find_fov
 from invrender.capture.lights import find_lights, level_table
 from invrender.capture.mirror import make_ball
@@ -100,6 +102,22 @@ def test_a_full_sphere_is_recognised(table, radius):
 def test_a_hemisphere_is_no_sphere(steel):
     found = find_lights(Capture(steel, RIG, PATTERN, unknown=UNKNOWN))
     assert found.lights.rig.ball_shape == "hemisphere" and found.ball.position[2] == 0
+
+
+def test_beside_the_sheet_the_balls_size_decides_its_shape(monkeypatch):
+    """A sphere that looks a little more like a hemisphere of another size; what the sheet measures
+    counts for more."""
+    seen = {"hemisphere": (0.9, 1.06), "sphere": (0.84, 1.0)}
+
+    def find_ball(photo, rig, *given):
+        confidence, size = seen[rig.ball_shape]
+        return SimpleNamespace(confidence=confidence, radius_m=size * rig.ball_radius)
+
+    monkeypatch.setattr(orientation, "find_ball", find_ball)
+    capture = Capture(Photo(np.ones((8, 8, 3), np.float32)), RIG, PATTERN, unknown=UNKNOWN)
+    for known, shape in (("rig", "hemisphere"), ("sheet", "sphere")):
+        found, _ = orientation.find_either_ball(replace(capture, fov_from=known), None, 1.0)
+        assert found.rig.ball_shape == shape
 
 
 @pytest.mark.parametrize("fov", [52.0, 84.0])
