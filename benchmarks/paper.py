@@ -51,7 +51,7 @@ PERFECT = 6  # captures under a pattern that the ball shows without a mosaic
 JUDGED = (0, 4, 8)  # of the nine re-rendered images: LPIPS and FLIP take as long as all else
 # The program's first network by the real materials that it saw: the shipped one, and the state from
 # which its training goes on with more of them.
-TRAINED_ON = {"64": "small.safetensors", "245": "training/small.safetensors"}
+TRAINED_ON = {"64": "training/small-64.safetensors", "245": "small.safetensors"}
 LONGEST = 128  # pixels a side of captures, as of the shipped networks' training
 
 # Rows of Table 1 by key: what they are called.
