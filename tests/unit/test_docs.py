@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import doctest
 import importlib
 import io
 import os
@@ -33,6 +34,9 @@ FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 # What stands for a value in the docs' commands, and a value that argparse takes.
 PLACEHOLDERS = {"N": "4", "X,Y,R": "1,2,3", "R,G,B": "1,1,1", "METRES": "0.1", "TARGET": "gltf"}
+
+
+EXAMPLES = sorted(p for p in (ROOT / "invrender").rglob("*.py") if ">>> " in p.read_text("utf-8"))
 
 
 def identity(path: Path) -> str:
@@ -233,3 +237,10 @@ def test_entries_of_the_log_are_whole(entry):
 def test_no_private_terms(page):
     text = FENCE.sub("", page.read_text("utf-8"))
     assert not re.findall(r"\b(told|untold|as usual)\b", text, re.IGNORECASE)
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=identity)
+def test_examples_in_docstrings_run(path):
+    module = importlib.import_module(".".join(path.relative_to(ROOT).with_suffix("").parts))
+    found = doctest.testmod(module)
+    assert found.attempted and not found.failed
