@@ -22,7 +22,7 @@ from invrender.maps import NAMES, Estimate, Maps
 from invrender.report.report import Report
 from invrender.types import Array, InputError
 
-SAMPLES = 256  # of the specular lobe in a rendering
+SAMPLES = 256  # of the specular lobe in the rendering that is kept
 # What is a number in `Report.capture_fit` but of the ball, not of the lights' fit.
 _BALL = ("ball_radius", "ball_confidence")
 PATTERNS = "shown", "captured"

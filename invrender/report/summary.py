@@ -14,14 +14,14 @@ from invrender.lights import Lights
 from invrender.maps import Estimate, Maps, map_errors, resize_maps
 from invrender.report.notices import map_notices
 from invrender.report.report import Report
-from invrender.report.result import Result
+from invrender.report.result import SAMPLES, Result
 from invrender.types import Array, Notice
 
 if TYPE_CHECKING:  # Dr.Jit compiles where the refinement is imported
     from invrender.refine.gauss_newton import Refined
     from invrender.render.renderer import Renderer
 
-FINE = 256  # pixels a side up to which a kept rendering takes twice the samples; its cost grows
+FINE = 256  # pixels a side up to which a kept rendering takes `SAMPLES`; its cost grows
 PACKAGES = ("invrender", "drjit", "mitsuba", "numpy")
 
 
@@ -47,7 +47,7 @@ def summarise(
     first, lights, capture = crops[k], found[k].lights, found[k].capture
     size = len(first.photo)
     # The second is kept; of the first, and of many pixels, only the error matters.
-    counts = ((start, samples), (refined.maps, 2 * samples if size <= FINE else samples))
+    counts = ((start, samples), (refined.maps, SAMPLES if size <= FINE else samples))
     pictures = [renderer.render(maps, count) for maps, count in counts]
     before, after = (photo_error(p, first.photo, first.clipped) for p in pictures)
     baked = baked_light(refined.maps.diffuse, renderer, samples)
