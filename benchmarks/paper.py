@@ -49,8 +49,8 @@ NUMBERS = Path(__file__).with_name("paper_numbers.toml")
 SHOWN = 4  # captures whose pictures are drawn
 PERFECT = 6  # captures under a pattern that the ball shows without a mosaic
 JUDGED = (0, 4, 8)  # of the nine re-rendered images: LPIPS and FLIP take as long as all else
-# The program's first network by the real materials that it saw: the shipped one, and the state from
-# which its training goes on with more of them.
+# The program's first network by the real materials that it saw: the state before its training went
+# on with more of them, and the shipped one.
 TRAINED_ON = {"64": "training/small-64.safetensors", "245": "small.safetensors"}
 LONGEST = 128  # pixels a side of captures, as of the shipped networks' training
 

@@ -162,7 +162,7 @@ def find_either_ball(
     found: list[tuple[float, Rig, Ball]] = []
     problem: InputError | None = None
     # The capture sheet measures the ball: taken for the other shape it is some 6% off.
-    weight = BALL_SHAPE.radius_weights[capture.fov_from == "sheet"]
+    weight = BALL_SHAPE.sheet_weight if capture.fov_from == "sheet" else 1.0
     for shape in BALL_SHAPES:
         shaped = replace(rig, ball_shape=shape)
         try:

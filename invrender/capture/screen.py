@@ -83,8 +83,9 @@ def fit_screen(
     ideal = fit.result(u)
     if ideal.residual < SCREEN_FIT.poor and ideal.saturated < SCREEN_FIT.saturated:
         return ideal
-    fit.hidden = fit.curved_file and ideal.saturated >= SCREEN_FIT.no_curve
-    ideal = fit.result(u)
+    if fit.curved_file and ideal.saturated >= SCREEN_FIT.no_curve:
+        fit.hidden = True
+        ideal = fit.result(u)
     fit.free[:_COLOUR] = True
     fit.free[_GAMMA] = ideal.saturated < SCREEN_FIT.no_display
     if ideal.saturated >= SCREEN_FIT.no_curve:

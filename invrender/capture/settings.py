@@ -338,9 +338,9 @@ class BallShape:
 
     # Confidence of a hemisphere, less its radius's relative error, from which no sphere is tried.
     certain: float = 0.8  # by hand
-    # Of that error against the confidence, without and with the capture sheet; by hand, on 15
-    # photographs of it.
-    radius_weights: tuple[float, float] = (1.0, 3.0)
+    # Of that error against the confidence, where the capture sheet measures the radius; by hand, on
+    # 15 photographs. Elsewhere 1.
+    sheet_weight: float = 3.0
 
 
 @dataclass(frozen=True)

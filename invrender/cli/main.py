@@ -24,8 +24,8 @@ SHELLS = ("bash", "zsh", "tcsh")  # shtab's
 def run(*argv: str) -> NoReturn:
     """Run a command, with the arguments of the process where none are given, and end the process.
 
-    At once: taking PyTorch and LLVM apart takes 0.4 s, in which nothing is done for anybody
-    (`python -m benchmarks size`).
+    At once: to take PyTorch and LLVM apart takes some tenths of a second, in which nothing is done
+    for anybody. What must end in order (files, other processes) has ended when `main` returns.
     """
     code = main(argv or None)
     with suppress(OSError):

@@ -37,7 +37,7 @@ from scipy.ndimage import gaussian_filter
 
 from invrender.refine.gauss_newton import Observation, Refined, bands, expected_spread
 from invrender.refine.priors import Prior
-from invrender.refine.theta import D, N, S, project, to_maps
+from invrender.refine.theta import D, N, S, dielectric_share, project, to_maps
 from invrender.sampling import resize
 from invrender.types import TINY, Array
 
@@ -51,7 +51,6 @@ class Settings:
     photo_noise: tuple[float, float] = (0.1, 0.05)  # of the pixel and of the photo's mean: lights
     unlikely: float = 1.0  # mean squared residual in its spread from which it counts less; by hand
     slope_share: float = 0.2  # of its step that a slope takes, roughness none; by hand
-    dielectric_f0: tuple[float, float] = (0.08, 0.15)  # surely dielectric; no longer one
     metal_f0: float = 0.2  # below it there is no metal; iron oxides have 0.2, metals 0.5 and more
     metal_range: tuple[float, float] = (
         0.6,
@@ -90,8 +89,7 @@ def read_materials(theta: Array, s: Settings = SETTINGS) -> Readings | None:
     """Both readings of maps θ (H, W, 9); None where the sample is of one kind."""
     f0 = theta[..., S].mean(-1)
     top = float(np.quantile(f0, s.greatest))
-    low, high = s.dielectric_f0
-    is_dielectric = np.clip((high - f0) / (high - low), 0, 1)
+    is_dielectric = dielectric_share(theta)
     low, high = (x * top for x in s.metal_range)
     is_metal = np.clip((f0 - low) / max(high - low, 1e-6), 0, 1) * (f0 > s.metal_f0)
     if min(is_dielectric.mean(), is_metal.mean()) < s.least_part:

@@ -36,7 +36,7 @@ from invrender.refine.flat import USUAL_SPECULAR
 from invrender.refine.gauss_newton import BAND, Observation, linearise
 from invrender.refine.groups import group
 from invrender.refine.priors import Prior, channel_correlation
-from invrender.refine.theta import D, N, R, S, project
+from invrender.refine.theta import D, N, R, S, dielectric_share, project
 from invrender.render.renderer import Renderer
 from invrender.sampling import centres
 from invrender.types import Array
@@ -77,7 +77,6 @@ class Settings:
     correlation: tuple[float, float] = (0.9, 0.95)  # of the channels of k_d, and of k_s
     relief: float = 1.0  # deviation of the share of the unresolved slopes that widens the lobe
     metal_f0: tuple[float, float] = (0.06, 0.36)  # k_s of no metal, and of nothing but metal
-    dielectric_f0: tuple[float, float] = (0.08, 0.15)  # surely dielectric; no longer one
     least_doubt: float = 0.001  # of the logarithm of the screen's radiance, at least
     room_doubt: float = 0.05  # of the room's
     lamp_doubt: float = 0.3  # of saturated lamps, whose brightness the table tells
@@ -123,7 +122,7 @@ def share(
 
     prior: a network's maps (H, W, 9), ``total`` their expected errors.
     """
-    theta = plain_dielectric(project(prior.mean.copy()), s)
+    theta = plain_dielectric(project(prior.mean.copy()))
     centres = materials(theta[grid(theta, s)], s)
     problem = _Problem(observations, prior, theta, centres, samples, s)
     solved = _solve(problem, s)
@@ -162,11 +161,9 @@ def light_doubt(fit: dict[str, float], s: Settings = SHARED_SETTINGS) -> tuple[f
     return max(float(fit.get("residual", 0.0)), s.least_doubt), room
 
 
-def plain_dielectric(theta: Array, s: Settings = SHARED_SETTINGS) -> Array:
+def plain_dielectric(theta: Array) -> Array:
     """Maps θ in which every dielectric has the usual f0, grey; in place."""
-    f0 = theta[..., S].mean(-1, keepdims=True)
-    low, high = s.dielectric_f0
-    theta[..., S] += np.clip((high - f0) / (high - low), 0, 1) * (USUAL_SPECULAR - theta[..., S])
+    theta[..., S] += dielectric_share(theta)[..., None] * (USUAL_SPECULAR - theta[..., S])
     return theta
 
 

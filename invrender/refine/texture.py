@@ -21,7 +21,7 @@ import numpy as np
 
 from invrender.refine.gauss_newton import Observation, linearise
 from invrender.refine.priors import Prior
-from invrender.refine.theta import D, N, R, S, project
+from invrender.refine.theta import D, N, R, dielectric_share, project
 from invrender.sampling import centres, resize
 from invrender.types import TINY, Array
 
@@ -40,7 +40,6 @@ class Settings:
     roughness: float = 0.05  # deviation of δ that is expected
     doubt: float = 0.02  # of what is measured of it: lights, relief
     times: float = 3.0  # by which its own error exceeds what the texture tells
-    dielectric_f0: tuple[float, float] = (0.08, 0.15)  # surely dielectric; no longer one
     shared_error: float = 0.5  # of a network's squared error that a material shares
 
 
@@ -65,8 +64,7 @@ def without_light(
 ) -> Prior:
     """The prior, of maps that explain the photos, with the roughness that the light's pattern in
     the albedo tells, and the albedo that it leaves."""
-    low, high = s.dielectric_f0
-    weight = np.clip((high - prior.mean[..., S].mean(-1)) / (high - low), 0, 1)
+    weight = dielectric_share(prior.mean)
     if weight.mean() < s.least_part:
         return prior
     found = [measure_light(o, prior.mean, weight, samples, s) for o in observations]

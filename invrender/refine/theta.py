@@ -10,6 +10,7 @@ from invrender.types import Array
 D, S, R, N = slice(0, 3), slice(3, 6), 6, slice(7, 9)  # places of the parameters in θ
 MIN_FITTED_ROUGHNESS = 0.03
 MAX_SLOPE = 3.0  # 72 degrees
+DIELECTRIC_TO_METAL = 0.08, 0.15  # f0: up to which a surface surely is one, and from which it is none
 
 
 def to_theta(maps: Maps) -> Array:
@@ -32,6 +33,12 @@ def deviations(sigma: Array) -> dict[str, Array]:
     slopes = np.sqrt(np.mean(sigma[..., N] ** 2, -1)) / 2
     parts = {"diffuse": sigma[..., D], "specular": sigma[..., S], "roughness": sigma[..., R]}
     return {k: np.ascontiguousarray(v, np.float32) for k, v in {**parts, "normal": slopes}.items()}
+
+
+def dielectric_share(theta: Array) -> Array:
+    """How surely each pixel of θ is a dielectric's, by its f0: (H, W) from 0 to 1."""
+    low, high = DIELECTRIC_TO_METAL
+    return np.clip((high - theta[..., S].mean(-1)) / (high - low), 0, 1)
 
 
 def project(theta: Array) -> Array:
