@@ -10,7 +10,10 @@ from invrender.types import Array
 D, S, R, N = slice(0, 3), slice(3, 6), 6, slice(7, 9)  # places of the parameters in θ
 MIN_FITTED_ROUGHNESS = 0.03
 MAX_SLOPE = 3.0  # 72 degrees
-DIELECTRIC_TO_METAL = 0.08, 0.15  # f0: up to which a surface surely is one, and from which it is none
+DIELECTRIC_TO_METAL = (
+    0.08,
+    0.15,
+)  # f0: up to which a surface surely is one, and from which it is none
 
 
 def to_theta(maps: Maps) -> Array:
