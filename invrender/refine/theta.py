@@ -13,7 +13,7 @@ MAX_SLOPE = 3.0  # 72 degrees
 DIELECTRIC_TO_METAL = (
     0.08,
     0.15,
-)  # f0: up to which a surface surely is one, and from which it is none
+)  # f0 of the last sure dielectric, and of the first sure metal
 
 
 def to_theta(maps: Maps) -> Array:
