@@ -20,6 +20,7 @@ learn from: so where the photo says nothing of a quantity, it learns to leave it
 from __future__ import annotations
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from nets.batch import Batch, split_channels
@@ -134,8 +135,11 @@ class Correction(nn.Module):
     def forward(self, batch: Batch) -> Batch:
         height, width = batch["photo"].shape[-2:]
         x = torch.nan_to_num(features(batch), 0.0, 0.0, 0.0)
+        # Convolutions pad with noughts, which the sample's border would show as a frame.
+        top, left = (min(self.multiple, n - 1) for n in (height, width))
+        x = F.pad(x, (left, left, top, top), mode="reflect")
         y, skips = self.encoder(pad_to(x, self.multiple))
-        y = self.decoder(self.middle(y), skips)[..., :height, :width]
+        y = self.decoder(self.middle(y), skips)[..., top : top + height, left : left + width]
         out = split_channels(y, CORRECTION_OUTPUTS)
         # Some of the way to the lobes, by the network's judgement, and a step of its own.
         share = torch.sigmoid(out["towards_lobes"] - DOUBT)

@@ -27,7 +27,7 @@ from nets.correction import (  # noqa: E402
     features,
     gauss_newton,
 )
-from nets.predict import Corrector, linearised  # noqa: E402
+from nets.predict import WEIGHTS, Corrector, linearised  # noqa: E402
 from nets.scales import Prediction, enlarged  # noqa: E402
 from nets.store import build, load_weights, save_weights  # noqa: E402
 
@@ -284,6 +284,26 @@ def test_an_interrupt_ends_all_photos(monkeypatch):
     maps, result, _ = estimate_maps([sample, sample], Stages())
     assert len(calls) == 1 and result.interrupted
     np.testing.assert_allclose(result.maps.diffuse, maps.diffuse, atol=0.02)
+
+
+def test_the_border_gets_no_frame():
+    """A uniform picture, from which the shipped correction moves far, moves alike everywhere."""
+    network, _ = load_weights(WEIGHTS / "correction.safetensors")
+    values = {
+        "photo": [0.3] * 3,
+        "image": [0.2] * 3,
+        "theta": [0.2] * 3 + [0.04] * 3 + [0.7, 0, 0],
+        "sigma0": [0.05, 0.05, 0.1, 0.02],
+        "jacobian": [1.0] * 3 + [0.5] * 3 + [-0.05] * 3 + [0.0] * 6,
+        "clipped": [0.0],
+        "lobes": [0.2] * 3 + [0.04] * 3 + [0.3],
+        "position": [0.0, 0.0],
+    }
+    batch = {k: torch.tensor(v)[:, None, None].expand(1, -1, 64, 48) for k, v in values.items()}
+    with torch.inference_mode():
+        out = network(batch)["roughness"][0, 0]
+    assert float((out[32, 24] - 0.7).abs()) > 0.05
+    assert float((out - out[32, 24]).abs().max()) < 0.02
 
 
 def test_weights_come_back(tmp_path):
