@@ -93,7 +93,8 @@ def explain_photos(
     if known.interrupted:
         result = Refined(to_maps(known.prior.mean), known.prior.expected, interrupted=True)
     else:
-        prior = without_light(known.observations, known.prior, samples=samples)
+        before = initial.maps.roughness
+        prior = without_light(known.observations, known.prior, before, samples=samples)
         result = explain(known.observations, prior, samples=samples)
         result.converged &= known.converged
     result.factors = known.factors

@@ -39,7 +39,7 @@ from invrender.refine.priors import Prior, channel_correlation
 from invrender.refine.theta import D, N, R, S, dielectric_share, project
 from invrender.render.renderer import Renderer
 from invrender.sampling import centres
-from invrender.types import Array
+from invrender.types import TINY, Array
 
 UNKNOWNS = 7  # of a material: what θ has but slopes
 KNOWN = (0.0, 0.0)  # doubt of lights that are known
@@ -218,6 +218,19 @@ def belongs(theta: Array, centres: Array, s: Settings = SHARED_SETTINGS) -> Arra
     apart = ((_features(theta, s)[..., None, :] - centres) ** 2).sum(-1)
     weight = np.exp((apart.min(-1, keepdims=True) - apart) / (2 * s.softness**2))
     return (weight / weight.sum(-1, keepdims=True)).astype(np.float32)
+
+
+def material_means(theta: Array, image: Array, s: Settings = SHARED_SETTINGS) -> Array:
+    """An image (H, W) averaged over each material of maps θ, weighed by what a pixel is of it."""
+    at = grid(theta, s)
+    centres = materials(theta[at], s)
+    weight = belongs(theta[at], centres, s)
+    means = np.einsum("hw,hwk->k", image[at], weight) / np.maximum(weight.sum((0, 1)), TINY)
+    found = np.empty_like(image)
+    rows = max(1, BAND // image.shape[1])
+    for top in range(0, len(image), rows):
+        found[top : top + rows] = belongs(theta[top : top + rows], centres, s) @ means
+    return found
 
 
 def grid(image: Array, s: Settings = SHARED_SETTINGS) -> tuple[Array, Array]:

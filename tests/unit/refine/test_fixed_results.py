@@ -167,7 +167,8 @@ def checked():
 
 
 def light():
-    return of_prior(without_light([shot()], prior(), s=replace(TEXTURE_SETTINGS, least_part=0.3)))
+    settings = replace(TEXTURE_SETTINGS, least_part=0.3)
+    return of_prior(without_light([shot()], prior(), prior().mean[..., R] + 0.05, s=settings))
 
 
 def mixed():

@@ -1,5 +1,7 @@
 """Roughness by the light's pattern in the albedo: found where it stands there, else kept."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,7 @@ from invrender.maps import constant_maps
 from invrender.pattern.default import default_pattern
 from invrender.refine.gauss_newton import Observation, linearise
 from invrender.refine.priors import network_prior
-from invrender.refine.texture import measure_light, without_light
+from invrender.refine.texture import TEXTURE_SETTINGS, _chosen, measure_light, without_light
 from invrender.refine.theta import D, R, S, to_maps, to_theta
 from invrender.render.fast.estimator import Fast
 from invrender.render.scene import make_scene
@@ -51,12 +53,16 @@ def explained(renderer, maps, off):
     return Observation(photo, renderer), network_prior(found, sigma)
 
 
+def found_in(observations, prior, first=None):
+    return without_light(observations, prior, prior.mean[..., R] if first is None else first)
+
+
 @pytest.mark.parametrize("off", [-0.08, 0.08])
 @pytest.mark.parametrize(("k_d", "rho"), [((0.3, 0.2, 0.1), 0.5), (0.05, 0.4), (0.1, 0.75)])
 def test_roughness_is_found_that_the_albedo_makes_up_for(renderer, k_d, rho, off):
     maps = sample(k_d, rho)
     observation, prior = explained(renderer, maps, off)
-    found = without_light([observation], prior)
+    found = found_in([observation], prior)
     was, now = (np.abs(p.mean[..., R].mean() - rho) for p in (prior, found))
     assert now < 0.5 * was
     before, after = (np.abs(p.mean[..., D] - maps.diffuse).mean() for p in (prior, found))
@@ -66,7 +72,7 @@ def test_roughness_is_found_that_the_albedo_makes_up_for(renderer, k_d, rho, off
 
 def test_the_albedo_takes_what_the_lobe_loses(renderer):
     observation, prior = explained(renderer, sample((0.3, 0.2, 0.1), 0.5), 0.08)
-    found = without_light([observation], prior)
+    found = found_in([observation], prior)
     rougher = prior.mean.copy()
     rougher[..., R] = found.mean[..., R]
     alone, both = (
@@ -79,7 +85,7 @@ def test_the_albedo_takes_what_the_lobe_loses(renderer):
 @pytest.mark.parametrize("rho", [0.4, 0.75])
 def test_true_maps_stay(renderer, rho):
     observation, prior = explained(renderer, sample((0.3, 0.2, 0.1), rho), 0.0)
-    found = without_light([observation], prior)
+    found = found_in([observation], prior)
     assert np.abs(found.mean[..., R] - rho).max() < 0.015
 
 
@@ -99,14 +105,73 @@ def test_metal_and_what_is_saturated_stay(renderer):
     metal = constant_maps(SIZE, SIZE, 0, 0.8, 0.4)
     observation, prior = explained(renderer, sample(0.2, 0.5), 0.08)
     clipped = Observation(observation.photo, renderer, np.ones((SIZE, SIZE), bool))
-    found = without_light([clipped], prior)
-    np.testing.assert_array_equal(found.mean[..., R], prior.mean[..., R])
+    found = found_in([clipped], prior)
+    np.testing.assert_allclose(found.mean[..., R], prior.mean[..., R], atol=1e-5)
     prior.mean[..., S] = to_theta(metal)[..., S]
-    assert without_light([observation], prior) is prior
+    assert found_in([observation], prior) is prior
 
 
 def test_two_photos_tell_more_than_one(renderer):
     observation, prior = explained(renderer, sample(0.2, 0.6), 0.08)
-    one, two = (without_light([observation] * n, prior) for n in (1, 2))
+    one, two = (found_in([observation] * n, prior) for n in (1, 2))
     moved = [float((p.mean - prior.mean)[..., R].mean()) for p in (one, two)]
     assert moved[1] < moved[0] < 0
+
+
+def test_a_first_start_that_was_right_is_gone_back_to(renderer):
+    observation, prior = explained(renderer, sample(0.3, 0.6, 0.5, 3), 0.05)
+    alone, beside = (
+        found_in([observation], prior, np.full((SIZE, SIZE), rho, np.float32)).mean[..., R].mean()
+        for rho in (0.65, 0.6)
+    )
+    assert abs(beside - 0.6) < abs(alone - 0.6) - 0.003
+
+
+def test_a_start_that_was_wrong_is_not(renderer):
+    observation, prior = explained(renderer, sample(0.3, 0.6), 0.0)
+    found = found_in([observation], prior, np.full((SIZE, SIZE), 0.75, np.float32))
+    assert abs(found.mean[..., R].mean() - 0.6) < 0.015
+
+
+def test_a_room_in_doubt_is_no_roughness(renderer):
+    """Of a room that is a tenth too bright some stands in the albedo: less is made of it where
+    that is expected."""
+    maps = sample(0.3, 0.6, 0.05)
+    dimmer = renderer.scaled(1.0, 0.8)
+    photo = dimmer.render(maps, 256)
+    theta = to_theta(maps)
+    for _ in range(2):
+        image, jacobian = linearise(renderer, theta, 256)
+        theta[..., D] += (photo - image) / jacobian[..., range(3), range(3)]
+    sure, unsure = (
+        measure_light(Observation(photo, renderer, None, doubt), theta, np.ones(maps.shape))
+        for doubt in ((0.0, 0.0), (0.0, 0.2))
+    )
+    assert abs(unsure.delta) < 0.5 * abs(sure.delta)
+
+
+def test_the_posterior_of_three_starts():
+    """Against the integral over δ."""
+    starts, odds = ((0.0, 0.01), (0.06, 0.02), (0.0, 0.08)), (1.0, 2.0, 3.0)
+    delta = np.linspace(-0.6, 0.6, 24001)
+    prior = sum(
+        w * np.exp(-(((delta - m) / s) ** 2) / 2) / s
+        for w, (m, s) in zip(odds, starts, strict=True)
+    )
+    for measured, deviation in ((0.05, 0.02), (-0.1, 0.05), (0.0, 0.3)):
+        p = prior * np.exp(-(((delta - measured) / deviation) ** 2) / 2)
+        mean = (p @ delta) / p.sum()
+        variance = (p @ (delta - mean) ** 2) / p.sum()
+        got = _chosen(measured, deviation**2, starts, odds)
+        assert got == pytest.approx((mean, variance), rel=1e-3, abs=1e-6)
+
+
+def test_within_a_material_roughness_is_evened_out(renderer):
+    observation, prior = explained(renderer, sample(0.3, 0.6), 0.0)
+    noise = 0.02 * np.random.default_rng(5).standard_normal((SIZE, SIZE)).astype(np.float32)
+    prior = replace(prior, mean=prior.mean.copy())
+    prior.mean[..., R] += noise
+    found = found_in([observation], prior).mean[..., R]
+    np.testing.assert_allclose(
+        found - found.mean(), TEXTURE_SETTINGS.within * (noise - noise.mean()), atol=2e-4
+    )
