@@ -35,7 +35,6 @@ if TYPE_CHECKING:  # Dr.Jit compiles where the refinement is imported
     Prepared = tuple[list[FoundLights], list[Sample]]
 
 MEGABYTES = 200e-6, 8  # of a result: a pixel, and for the rest
-ASKED = 2  # photos of several whose maps networks estimate
 
 
 class Stages:
@@ -261,15 +260,17 @@ def _ask_networks(
     samples: int,
     stage: Stages,
 ) -> Initial:
-    """What networks know of a sample, from the photos whose pattern they know best, and in which it
-    is not turned."""
-    from invrender.refine.estimate import Initial
-    from invrender.refine.priors import network_prior
+    """What networks know of a sample, from one photo or two, or of several from the one whose
+    pattern they know best; and in which it is not turned."""
+    from invrender.refine.estimate import MEASURING_PHOTOS, Initial
+    from invrender.refine.priors import network_prior, pooled
     from invrender.refine.several import by_pattern
 
     reconstruct, improve = networks
     asked = by_pattern([c.lights.pattern for c in crops], default_pattern())
-    asked = [i for i in asked if crops[i].is_straight][:ASKED]
+    asked = [i for i in asked if crops[i].is_straight]
+    if len(photos) >= MEASURING_PHOTOS:
+        asked = asked[:1]
     with stage("initial maps"):
         told = stage.part("initial maps")
         estimates = [reconstruct(crops[i].photo, crops[i].lights, told) for i in asked]
@@ -284,8 +285,9 @@ def _ask_networks(
             if interrupted:
                 break
     priors = [network_prior(e.maps, e.sigma) for e in estimates]
-    known = lobes.maps if lobes is not None and len(photos) == 1 else None
-    return Initial(start, priors, known, interrupted=interrupted)
+    alone = len(photos) == 1 or len(photos) >= MEASURING_PHOTOS
+    known = lobes.maps if lobes is not None and alone else None
+    return Initial(start, pooled(priors), asked[0], known, interrupted)
 
 
 def _registered(

@@ -1,7 +1,8 @@
 """The maps of a sample's photos: where they start, and which solver they call for.
 
 One photo or two leave much to the networks: what their materials share, then the posterior of each
-pixel. `MEASURING_PHOTOS` and more measure: their joint posterior at full strength.
+pixel. `MEASURING_PHOTOS` and more measure: their joint posterior at full strength, from the maps of
+the one that networks know best.
 """
 
 from __future__ import annotations
@@ -16,11 +17,11 @@ from invrender.refine.gauss_newton import Observation, Refined, refine
 from invrender.refine.lobes import fit_lobes
 from invrender.refine.mirrors import take_mirrors
 from invrender.refine.posterior import explain
-from invrender.refine.priors import Prior, lobe_prior, pooled
-from invrender.refine.several import explain_together, likeliest, plain_prior
+from invrender.refine.priors import Prior, lobe_prior
+from invrender.refine.several import explain_together, plain_prior
 from invrender.refine.shared import light_doubt, share
 from invrender.refine.texture import without_light
-from invrender.refine.theta import to_maps
+from invrender.refine.theta import to_maps, to_theta
 from invrender.render.near import renderer_under
 from invrender.types import Array, Mask
 
@@ -31,20 +32,15 @@ MEASURING_PHOTOS = 3  # photos from which these count for more than what network
 class Initial:
     """Maps before the photos are explained.
 
-    priors: of each photo whose maps networks estimated, or one of all. lobes: what the light's
-    pattern says of a photo alone, if it was asked. flat: whether no network knows the sample.
+    asked: the photo that networks know best, None where no network knows the sample. lobes: what
+    the light's pattern says of this photo, if it was asked alone.
     """
 
     maps: Maps
-    priors: list[Prior]
+    prior: Prior
+    asked: int | None = None
     lobes: Maps | None = None
-    flat: bool = False
     interrupted: bool = False
-
-    @property
-    def prior(self) -> Prior:
-        """What all photos' networks say together."""
-        return pooled(self.priors)
 
 
 def observe(photo: Array, lights: Lights, clipped: Mask) -> Observation:
@@ -57,13 +53,13 @@ def flat_start(photos: Sequence[Observation], samples: int) -> Initial:
     """Without a network: constant maps, and what the light's pattern says of the materials."""
     first = photos[0]
     prior = lobe_prior(fit_lobes(first.photo, first.renderer, samples))
-    return Initial(flat_maps(first.photo, first.renderer, samples), [prior], flat=True)
+    return Initial(flat_maps(first.photo, first.renderer, samples), prior)
 
 
 def plain_start(photos: Sequence[Observation], samples: int) -> Initial:
     """For several photos without a display: what all of them say of a flat sample."""
     prior = plain_prior(photos, samples)
-    return Initial(to_maps(prior.mean), [prior], flat=True)
+    return Initial(to_maps(prior.mean), prior)
 
 
 def explain_photos(
@@ -81,12 +77,25 @@ def explain_photos(
     kept, prior = list(photos), initial.prior
     if initial.interrupted:
         return Refined(to_maps(prior.mean), prior.expected, interrupted=True), kept
-    if len(photos) >= MEASURING_PHOTOS:
-        if not initial.flat:
-            prior = likeliest(photos, [*initial.priors, prior], samples)
-        return explain_together(photos, prior, samples=samples, progress=progress), kept
-    if initial.flat:
+    measured = len(photos) >= MEASURING_PHOTOS
+    if initial.asked is None and not measured:
         return refine(photos, prior, samples=samples, progress=step), kept
+    if initial.asked is not None:
+        few = [photos[initial.asked]] if measured else photos
+        result, observed = _explain_few(few, initial, samples)
+        if not measured:
+            return result, observed
+        if result.interrupted:
+            return result, kept
+        prior = Prior(to_theta(result.maps), result.sigma, prior.correlation)
+    return explain_together(photos, prior, samples=samples, progress=progress), kept
+
+
+def _explain_few(
+    photos: Sequence[Observation], initial: Initial, samples: int
+) -> tuple[Refined, list[Observation]]:
+    """`explain_photos` for one photo or two, of which networks know the sample."""
+    prior = initial.prior
     if initial.lobes is not None:
         prior = take_mirrors(photos[0], prior, initial.lobes, samples=samples)
     known = share(photos, prior, samples=samples)

@@ -34,7 +34,8 @@ class Settings:
     exposure_found: float = 0.02  # and of what is found of it
     unlikely: float = 9.0  # mean squared residual over its variance that counts half
     diffuse: float = 0.3  # prior deviations of θ, of a dielectric
-    unexplained: float = 0.3  # of the photos' means, from which on the initial maps are kept
+    around: int = 3  # pixels a side whose misfits are taken together
+    most_misfit: float = 1e6  # of a photo, that is counted
     trusted: float = 1.0  # times what is expected of the initial maps' errors, of that of k_d
     least_diffuse: float = 0.01  # that deviation, at least
     dielectric_f0: float = 0.003  # with 0.01 it grows with the photos, and takes up their errors
@@ -169,8 +170,7 @@ class Problem:
 
     def prior_precision(self) -> Array:
         """Of θ before the photos are seen, (h, W, 9, 9)."""
-        precision = np.linalg.inv(channel_correlation(*self.s.correlation)).astype(np.float32)
-        return np.asarray(precision / (self.sigma[..., :, None] * self.sigma[..., None, :]))
+        return precision_of(self.sigma, self.s)
 
     def terms(self, theta: Array) -> Iterator[Term]:
         """What each photo says of θ, one after another."""
@@ -187,19 +187,28 @@ class Problem:
             yield Term(image, residual, jacobian, weight, misfit)
 
     def search(self, start: Array, steps: int) -> tuple[Point, bool]:
-        """`solve`, after some steps that a narrow lobe or a bad start does not stop: with wider
-        lobes, and without forgetting what is far off."""
+        """`solve`; and where pixels are lost, the better of it and of steps that a narrow lobe or a
+        bad start does not stop: first with wider lobes, and without forgetting what is far off."""
+        point, done = self.solve(start, steps)
+        if self._lost(point).mean() <= self.s.few_lost:
+            return point, done
         s = replace(self.s, unlikely=self.s.forgiving * self.s.unlikely)
         mean, sigma, start = self.mean.copy(), self.sigma.copy(), start.copy()
         mean[..., R] = start[..., R] = np.maximum(self.mean[..., R], s.blurred)
         sigma[..., R] = s.fixed
         found = replace(self, mean=mean, sigma=sigma, s=s).solve(start, s.few)[0].theta
         found[..., R] = self.mean[..., R]
-        point, _ = replace(self, s=s).solve(found, s.few)
-        lost = point.misfit.mean(0) > s.lost
+        other, _ = replace(self, s=s).solve(found, s.few)
+        lost = self._lost(other)
         if lost.mean() > s.few_lost:
-            point = self._slopes_tried(point.theta, lost, s)
-        return self.solve(point.theta, steps)
+            other = self._slopes_tried(other.theta, lost, s)
+        other, done = self.solve(other.theta, steps)
+        point.take(other, other.cost < point.cost)
+        return point, done
+
+    def _lost(self, point: Point) -> NDArray[np.bool_]:
+        """Which pixels are at no optimum."""
+        return np.asarray(point.misfit.mean(0) > self.s.lost)
 
     def _slopes_tried(self, found: Array, lost: NDArray[np.bool_], s: Settings) -> Point:
         """θ with the best of several slopes where it is lost, after a few steps."""
@@ -245,6 +254,12 @@ def _in_range(theta: Array) -> Array:
     return theta
 
 
+def precision_of(sigma: Array, s: Settings) -> Array:
+    """Of θ with these deviations (h, W, 9), the colours of an albedo varying together."""
+    precision = np.linalg.inv(channel_correlation(*s.correlation)).astype(np.float32)
+    return np.asarray(precision / (sigma[..., :, None] * sigma[..., None, :]))
+
+
 def wide_deviations(theta: Array, rho: Array, s: Settings) -> Array:
     """Prior deviations of θ (h, W, 9), given those of ρ (h, W)."""
     low, high = s.f0_range
@@ -260,5 +275,9 @@ def noise_of(misfit: Array, s: Settings) -> Array:
     """Each photo's noise (n,) in units of the one that its variance assumes, by the lower quartile
     of the pixels' misfits (n, h, W): a share of what the noise leaves is fitted."""
     scatter = np.quantile(misfit.reshape(len(misfit), -1), s.quantile, 1)
-    free = max(1 - min(1.0, 2 / len(misfit)), 1 / 3)
-    return np.asarray(np.sqrt(scatter / (CHI_SQUARED_QUARTILE / 3 * free)))
+    return np.asarray(np.sqrt(scatter / (CHI_SQUARED_QUARTILE / 3 * free_share(len(misfit)))))
+
+
+def free_share(photos: int) -> float:
+    """Of the noise, what a fit of six unknowns leaves of so many photos' three numbers a pixel."""
+    return max(1 - 2 / photos, 1 / 3)

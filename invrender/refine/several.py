@@ -13,6 +13,8 @@ photos say of all pixels of the material together (`invrender.refine.shared_roug
 
 Each photo's noise and its exposure are what the others leave of it: Rᵢ grows with its residuals,
 and a factor a colour is taken out. A photo whose residuals are far beyond the others' is left out.
+A pixel's noise is at least as large as what θ leaves of its photos; with it the initial maps and
+their expected errors count as well, most where no θ explains the photos.
 """
 
 from __future__ import annotations
@@ -26,7 +28,17 @@ from scipy import ndimage
 
 from invrender.refine.flat import flat_maps
 from invrender.refine.gauss_newton import BAND, Observation, Refined, linearise
-from invrender.refine.pixels import TOGETHER, Photo, Problem, Settings, noise_of, wide_deviations
+from invrender.refine.pixels import (
+    TOGETHER,
+    Photo,
+    Point,
+    Problem,
+    Settings,
+    free_share,
+    noise_of,
+    precision_of,
+    wide_deviations,
+)
 from invrender.refine.priors import Prior, channel_correlation
 from invrender.refine.registration import factor_deviations
 from invrender.refine.shared_roughness import Pooled, pool_roughness
@@ -43,24 +55,6 @@ def by_pattern(patterns: Sequence[Array], known: Array) -> list[int]:
     known = resize_pattern(known, COMPARED_CELLS)
     unlike = [float(np.abs(resize_pattern(p, COMPARED_CELLS) - known).mean()) for p in patterns]
     return sorted(range(len(patterns)), key=lambda i: round(unlike[i], 2))
-
-
-def likeliest(
-    observations: Sequence[Observation],
-    priors: Sequence[Prior],
-    samples: int,
-    s: Settings = TOGETHER,
-) -> Prior:
-    """The prior whose slopes and roughness leave the least of all photos, albedos being free."""
-    if len(priors) == 1:
-        return priors[0]
-    photos, costs = [Photo.of(o) for o in observations], []
-    for prior in priors:
-        problem = _small(photos, project(prior.mean.copy()), s.fixed, samples, s)
-        problem.sigma[..., N] = s.fixed
-        point, _ = problem.solve(problem.mean, s.few)
-        costs.append(float(point.cost.mean()))
-    return priors[int(np.argmin(costs))]
 
 
 def plain_prior(observations: Sequence[Observation], samples: int, s: Settings = TOGETHER) -> Prior:
@@ -110,11 +104,7 @@ def explain_together(
         pooled = _pool(photos, theta, sigma[..., R], samples, s)
         s = replace(s, slope=_relief(photos, pooled, theta, samples, s))
         progress(0.4)
-        start, expected = theta.copy(), sigma.copy()
         errors, result.converged = _solve_all(photos, pooled, theta, sigma, samples, s)
-        if np.sqrt(np.mean(np.square(errors))) > s.unexplained:
-            # What does not explain the photos has measured nothing.
-            theta[...], sigma[...], result.converged = start, expected, False
         result.photo_errors, result.left_out = errors, left_out
         error = float(np.sqrt(np.mean(np.square(errors))))
         result.history = [{"seconds": time.perf_counter() - began, "photo_error": error}]
@@ -234,15 +224,38 @@ def _solve_all(
         go = problem.search if start is mean else problem.solve
         point, done = go(start[band], steps)
         converged &= done
-        theta[band] = project(point.theta.copy())
-        variance = np.einsum("hwpp->hwp", np.linalg.inv(point.hessian))
+        found, covariance = _weighed(problem, point, theta[band], sigma[band])
+        theta[band] = project(found)
+        variance = np.einsum("hwpp->hwp", covariance)
         variance[..., :6] += (s.lights_error * point.theta[..., :6]) ** 2
         sigma[band] = np.sqrt(variance)
         for i, photo in enumerate(photos):
             o = photo.observation
-            image, _ = linearise(o.renderer, point.theta, samples, top=top, height=height)
+            image, _ = linearise(o.renderer, theta[band], samples, top=top, height=height)
             use = np.ones(image.shape[:2], bool) if o.clipped is None else ~o.clipped[band]
             squares[i] += float(((o.photo[band] - image)[use] ** 2).mean(-1).sum(dtype=np.float64))
             seen[i] += use.sum()
     means = np.array([p.mean for p in photos])
     return list(np.sqrt(squares / np.maximum(seen, 1)) / means), converged
+
+
+def _weighed(
+    problem: Problem, point: Point, initial: Array, expected: Array
+) -> tuple[Array, Array]:
+    """θ (h, W, 9) and its covariance, with noise as large as what θ leaves of a pixel's photos, and
+    with the initial maps and their expected errors.
+
+    What no θ explains, such as relief finer than a pixel, has measured little: there the initial
+    maps count for most.
+    """
+    s = problem.s
+    misfit = np.minimum(point.misfit, s.most_misfit).mean(0) / free_share(len(point.misfit))
+    misfit = np.maximum(misfit, ndimage.uniform_filter(misfit, s.around, mode="nearest"))
+    excess = np.maximum(misfit, 1.0)[..., None]
+    wide, known = problem.prior_precision(), precision_of(expected, s)
+    drawn = np.einsum("hwpq,hwq->hwp", wide, point.theta - problem.mean)
+    data = (point.hessian - wide) / excess[..., None]
+    pull = (point.gradient + drawn) / excess - drawn
+    pull -= np.einsum("hwpq,hwq->hwp", known, point.theta - initial)
+    covariance = np.linalg.inv(data + wide + known)
+    return point.theta + np.einsum("hwpq,hwq->hwp", covariance, pull), covariance

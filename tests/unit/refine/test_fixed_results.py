@@ -27,7 +27,7 @@ from invrender.refine.pixels import TOGETHER
 from invrender.refine.posterior import explain
 from invrender.refine.priors import lobe_prior, network_prior, pooled
 from invrender.refine.registration import register
-from invrender.refine.several import explain_together, likeliest
+from invrender.refine.several import explain_together
 from invrender.refine.shared import share
 from invrender.refine.texture import TEXTURE_SETTINGS, without_light
 from invrender.refine.theta import N, R, deviations, to_maps, to_theta
@@ -162,7 +162,6 @@ def checked():
         "lobe": lobe_prior(sample()).sigma,
         "pooled": pooled([prior(), prior(0.5)]).mean,
         "total": pooled([prior(), prior(0.5)]).expected,
-        "likeliest": likeliest(several(), [prior(3.0), prior(0.1)], 64).mean,
     }
 
 
