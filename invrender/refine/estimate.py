@@ -16,6 +16,7 @@ from invrender.refine.flat import flat_maps
 from invrender.refine.gauss_newton import Observation, Refined, refine
 from invrender.refine.lobes import fit_lobes
 from invrender.refine.mirrors import take_mirrors
+from invrender.refine.plain import evened, keep_level
 from invrender.refine.posterior import explain
 from invrender.refine.priors import Prior, lobe_prior
 from invrender.refine.several import explain_together, plain_prior
@@ -101,10 +102,15 @@ def _explain_few(
     known = share(photos, prior, samples=samples)
     if known.interrupted:
         result = Refined(to_maps(known.prior.mean), known.prior.expected, interrupted=True)
-    else:
-        before = initial.maps.roughness
-        prior = without_light(known.observations, known.prior, before, samples=samples)
-        result = explain(known.observations, prior, samples=samples)
-        result.converged &= known.converged
-    result.factors = known.factors
-    return result, list(known.observations)
+        result.factors = known.factors
+        return result, known.observations
+    start = initial.maps
+    prior = without_light(known.observations, known.prior, start.roughness, samples=samples)
+    kept, prior, level = keep_level(known.observations, prior, start.diffuse)
+    result = explain(kept, prior, samples=samples)
+    result.maps = to_maps(evened(to_theta(result.maps)))
+    result.converged &= known.converged
+    result.factors = [
+        (level * screen, level * room, level * lamps) for screen, room, lamps in known.factors
+    ]
+    return result, kept

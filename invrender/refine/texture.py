@@ -12,10 +12,8 @@ the mean colour and of two across it. How well is told by the texture itself: wh
 mirrored and turned, in which no δ stands, is the error of δ, and so is what parts of other sizes
 find.
 
-- **Starts.** Either the maps are right, or the first network was, whose roughness a correction has
-  changed, or neither: three priors of δ, and the photo chooses.
-- **Within a material** dielectrics vary little in roughness; most of what networks see of it is
-  noise of the photo, or its light.
+Either the maps are right, or the first network was, whose roughness a correction has changed, or
+neither: three priors of δ, and the photo chooses.
 """
 
 from __future__ import annotations
@@ -27,7 +25,6 @@ import numpy as np
 
 from invrender.refine.gauss_newton import Observation, linearise
 from invrender.refine.priors import Prior
-from invrender.refine.shared import material_means
 from invrender.refine.theta import D, N, R, dielectric_share, project
 from invrender.sampling import centres, resize
 from invrender.types import TINY, Array
@@ -48,7 +45,6 @@ class Settings:
     doubt: float = 0.02  # of what is measured of δ: lights, relief
     starts: tuple[float, ...] = (1, 1, 2)  # odds of these maps, of the first network's, of neither
     near: float = 0.015  # deviation of δ where a start is right
-    within: float = 1 / 3  # of what roughness varies by within a material: the rest is noise
     shared_error: float = 0.5  # of a network's squared error that a material shares
 
 
@@ -91,10 +87,8 @@ def without_light(
     delta, variance = _chosen(measured, 1 / sum(precisions), starts, s.starts)
     light = resize(np.mean([m.light for m in found], 0), *weight.shape)
     theta, total = prior.mean.copy(), prior.expected.copy()
-    uneven = theta[..., R] - material_means(theta, theta[..., R])
     theta[..., R] += weight * np.float32(delta)
     theta[..., D] -= delta * weight[..., None] * light
-    theta[..., R] -= (1 - s.within) * weight * uneven
     left = min(1.0, variance / usual**2)  # of the expected variance
     total[..., R] *= np.sqrt(1 - s.shared_error * (1 - left) * weight)
     return replace(prior, mean=project(theta), total=total)

@@ -1,0 +1,84 @@
+"""What a plain dielectric's maps keep of what the photo asks for: little that is noise or light.
+
+- **Level.** Where the photo asks for an albedo a few per cent off the first network's, the lights'
+  strength, told by a ball, is as likely to be off by that: they take it.
+- **Variation.** Roughness varies little within a material; of what networks see of it most is noise
+  of the photo, or its light. Nor is there a texture where the means of a few pixels differ by no
+  more than noise and light do: then the albedo's variation is noise too, and is left out.
+
+Both are shrunk by what is expected of such errors, c, as a change or a deviation x: by 1 - (c/x)²
+or the square of that, and wholly below c (Breiman's garrote, 1995). What is well above stays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from invrender.refine.gauss_newton import Observation
+from invrender.refine.priors import Prior
+from invrender.refine.shared import KNOWN, material_means
+from invrender.refine.theta import D, R, dielectric_share, project
+from invrender.sampling import resize
+from invrender.types import TINY, Array
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Chosen by hand on 66 simulated photographs
+    (docs/research-log/2026-11-30-plain-samples.md)."""
+
+    least_part: float = 0.9  # of the sample that is dielectric
+    level: float = 0.03  # of the lights' strength in each colour, that is not told
+    roughness: float = 1 / 3  # of its variation within a material that is kept
+    parts: int = 64  # a side, whose means tell whether there is a texture
+    contrast: tuple[float, float] = (0.03, 0.003)  # of plain samples' means: of k_d, and at least
+
+
+PLAIN_SETTINGS = Settings()
+
+
+def keep_level(
+    observations: Sequence[Observation], prior: Prior, first: Array, s: Settings = PLAIN_SETTINGS
+) -> tuple[list[Observation], Prior, Array]:
+    """The photos, the prior with the albedo's level as the photo lets it be, and by what RGB their
+    lights were multiplied for that.
+
+    first: the first network's albedo (H, W, 3).
+    """
+    weight = dielectric_share(prior.mean)
+    if weight.mean() < s.least_part or any(o.doubt == KNOWN for o in observations):
+        return list(observations), prior, np.ones(3, np.float32)
+    asked, before = (_mean(x, weight) + TINY for x in (prior.mean[..., D], first))
+    change = np.log(asked / before)
+    left = np.exp(change * np.minimum(1, (s.level / (np.abs(change) + TINY)) ** 2))
+    left = left.astype(np.float32)
+    mean = prior.mean.copy()
+    mean[..., D] *= 1 + weight[..., None] * (1 / left - 1)
+    shots = [replace(o, renderer=o.renderer.scaled(left, left)) for o in observations]
+    return shots, replace(prior, mean=mean), left
+
+
+def evened(theta: Array, s: Settings = PLAIN_SETTINGS) -> Array:
+    """Maps θ (H, W, 9) without what of their variation is noise; in place."""
+    weight = dielectric_share(theta)
+    if weight.mean() < s.least_part:
+        return theta
+    uneven = theta[..., R] - material_means(theta, theta[..., R])
+    mean = _mean(theta[..., D], weight)
+    size = tuple(min(s.parts, n) for n in weight.shape)
+    variance = float(np.mean((resize(theta[..., D], *size) - mean) ** 2))
+    of, least = s.contrast
+    plain = (of * mean.mean()) ** 2 + least**2
+    noise = min(1.0, plain / (variance + TINY)) ** 2
+    theta[..., D] -= noise * weight[..., None] * (theta[..., D] - np.float32(mean))
+    theta[..., R] -= (1 - s.roughness) * weight * uneven
+    return project(theta)
+
+
+def _mean(image: Array, weight: Array) -> Array:
+    """Weighted mean (3,) of an image (H, W, 3)."""
+    total = np.einsum("hwc,hw->c", image, weight, dtype=np.float64)
+    return np.asarray(total / weight.sum(dtype=np.float64))

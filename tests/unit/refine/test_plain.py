@@ -1,0 +1,131 @@
+"""Noise and the lights' doubt stay out of plain maps; textures and metals stay as they are."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from invrender.data.environments import procedural_environment
+from invrender.maps import constant_maps
+from invrender.pattern.default import default_pattern
+from invrender.refine.estimate import Initial, explain_photos
+from invrender.refine.gauss_newton import Observation
+from invrender.refine.plain import PLAIN_SETTINGS, evened, keep_level
+from invrender.refine.priors import network_prior
+from invrender.refine.theta import D, R, S, project, to_maps, to_theta
+from invrender.render.fast.estimator import Fast
+from invrender.render.scene import make_scene
+from invrender.rig import Rig
+from invrender.sphere import scale_environment
+
+SIZE = 128
+ALBEDO = np.float32([0.5, 0.4, 0.3])
+
+
+@pytest.fixture(scope="module")
+def renderer():
+    room = scale_environment(procedural_environment(3, 64), 0.3)
+    return Fast(make_scene(Rig(), default_pattern(), room, 2.0))
+
+
+def flat(k_d=ALBEDO, k_s=0.04):
+    return constant_maps(SIZE, SIZE, k_d, k_s, 0.6)
+
+
+def asked(renderer, factor, doubt=(0.01, 0.05), k_s=0.04):
+    """A photo that asks for ``factor`` times the first network's albedo; its prior."""
+    maps = flat(ALBEDO * np.float32(factor), k_s)
+    shape = (SIZE, SIZE)
+    sigma = {
+        k: np.full(shape, 0.05, np.float32) for k in ("normal", "diffuse", "roughness", "specular")
+    }
+    return Observation(renderer.render(maps, 64), renderer, None, doubt), network_prior(maps, sigma)
+
+
+def test_a_level_within_the_lights_doubt_is_the_lights(renderer):
+    factor = np.float32([1.02, 0.98, 1.0])
+    photo, prior = asked(renderer, factor)
+    (shot,), found, left = keep_level([photo], prior, flat().diffuse)
+    np.testing.assert_allclose(found.mean[..., D], flat().diffuse, rtol=1e-4)
+    np.testing.assert_allclose(left, factor, rtol=1e-4)
+    shown = shot.renderer.render(to_maps(found.mean), 64)
+    np.testing.assert_allclose(shown, photo.photo, rtol=0.01)
+    assert np.abs(renderer.render(to_maps(found.mean), 64) / photo.photo - 1).max() > 0.015
+
+
+def test_a_level_well_above_it_is_the_samples(renderer):
+    photo, prior = asked(renderer, 1.3)
+    _, found, left = keep_level([photo], prior, flat().diffuse)
+    taken = np.log(found.mean[..., D].mean((0, 1)) / ALBEDO)
+    doubt = PLAIN_SETTINGS.level
+    np.testing.assert_allclose(taken, np.log(1.3) - doubt**2 / np.log(1.3), rtol=1e-3)
+    np.testing.assert_allclose(np.log(left) + taken, np.log(1.3), rtol=1e-3)
+
+
+@pytest.mark.parametrize(("doubt", "k_s"), [((0.0, 0.0), 0.04), ((0.01, 0.05), 0.6)])
+def test_known_lights_and_metals_keep_their_level(renderer, doubt, k_s):
+    photo, prior = asked(renderer, 1.02, doubt, k_s)
+    (shot,), found, left = keep_level([photo], prior, flat().diffuse)
+    assert shot is photo and found is prior
+    np.testing.assert_array_equal(left, 1)
+
+
+def noisy(deviation, of=1, k_d=ALBEDO, k_s=0.04):
+    """θ of a flat sample whose albedo varies from square to square of ``of`` pixels, relatively,
+    and whose roughness does from pixel to pixel."""
+    theta = to_theta(flat(k_d, k_s))
+    rng = np.random.default_rng(1)
+    n = SIZE // of
+    theta[..., D] *= 1 + np.kron(deviation * rng.standard_normal((n, n, 1)), np.ones((of, of, 1)))
+    theta[..., R] += 0.02 * rng.standard_normal((SIZE, SIZE))
+    return project(theta)
+
+
+@pytest.mark.parametrize(("deviation", "k_d"), [(0.04, ALBEDO), (0.3, np.float32([0.01] * 3))])
+def test_noise_of_a_plain_sample_goes(deviation, k_d):
+    theta = noisy(deviation, k_d=k_d)
+    before = theta[..., D].copy()
+    after = evened(theta)[..., D]
+    assert after.std((0, 1)).max() < 0.1 * before.std((0, 1)).min()
+    np.testing.assert_allclose(after.mean((0, 1)), before.mean((0, 1)), rtol=1e-3)
+
+
+@pytest.mark.parametrize(("deviation", "of"), [(0.12, 4), (0.3, 1)])
+def test_a_texture_stays(deviation, of):
+    theta = noisy(deviation, of)
+    before = theta[..., D].copy()
+    np.testing.assert_allclose(evened(theta)[..., D], before, atol=0.02 * before.std())
+
+
+def test_roughness_keeps_a_third_of_its_variation():
+    theta = noisy(0.3, 8)
+    uneven = theta[..., R] - theta[..., R].mean()
+    after = evened(theta)[..., R]
+    slope = float((after * uneven).sum() / (uneven**2).sum())
+    assert slope == pytest.approx(PLAIN_SETTINGS.roughness, abs=0.03)
+
+
+def test_metal_keeps_all_of_it():
+    theta = noisy(0.01, k_d=np.float32([0, 0, 0]), k_s=0.6)
+    before = theta.copy()
+    np.testing.assert_array_equal(evened(theta), before)
+    theta[:, : SIZE // 4, S], theta[:, SIZE // 4 :, S] = 0.6, 0.04  # a quarter is one
+    before = theta.copy()
+    np.testing.assert_array_equal(evened(theta), before)
+
+
+def test_the_whole_refinement_does_both(renderer):
+    """A flat sample's noisy photo, 2% brighter than the network's maps under lights in doubt."""
+    photo, prior = asked(renderer, 1.02)
+    noise = 0.04 * np.random.default_rng(2).standard_normal(photo.photo.shape)
+    photo = replace(photo, photo=(photo.photo * (1 + noise)).astype(np.float32))
+    start = Initial(flat(), [replace(prior, mean=to_theta(flat()))])
+    result, (shot,) = explain_photos([photo], start, 64, lambda s: None, lambda i, e: None)
+    found = result.maps.diffuse
+    np.testing.assert_allclose(found.mean((0, 1)), ALBEDO, rtol=0.005)
+    assert found.std((0, 1)).max() < 0.005
+    shown = shot.renderer.render(result.maps, 64).mean((0, 1))
+    np.testing.assert_allclose(shown, photo.photo.mean((0, 1)), rtol=0.01)
+    (screen, room, _), *_ = result.factors
+    both = renderer.scaled(screen, room).render(result.maps, 64).mean((0, 1))
+    np.testing.assert_allclose(both, shown, rtol=0.002)
