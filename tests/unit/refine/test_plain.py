@@ -119,7 +119,7 @@ def test_the_whole_refinement_does_both(renderer):
     photo, prior = asked(renderer, 1.02)
     noise = 0.04 * np.random.default_rng(2).standard_normal(photo.photo.shape)
     photo = replace(photo, photo=(photo.photo * (1 + noise)).astype(np.float32))
-    start = Initial(flat(), [replace(prior, mean=to_theta(flat()))])
+    start = Initial(flat(), replace(prior, mean=to_theta(flat())), asked=0)
     result, (shot,) = explain_photos([photo], start, 64, lambda s: None, lambda i, e: None)
     found = result.maps.diffuse
     np.testing.assert_allclose(found.mean((0, 1)), ALBEDO, rtol=0.005)
