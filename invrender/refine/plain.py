@@ -3,8 +3,8 @@
 - **Level.** Where the photo asks for an albedo a few per cent off the first network's, the lights'
   strength, told by a ball, is as likely to be off by that: they take it.
 - **Variation.** Roughness varies little within a material; of what networks see of it most is noise
-  of the photo, or its light. Nor is there a texture where the means of a few pixels differ by no
-  more than noise and light do: then the albedo's variation is noise too, and is left out.
+  of the photo, or its light. Nor is there a texture where neighbouring pixels hardly vary together:
+  then the albedo's variation is noise too, and is left out.
 
 Both are shrunk by what is expected of such errors, c, as a change or a deviation x: by 1 - (c/x)²
 or the square of that, and wholly below c (Breiman's garrote, 1995). What is well above stays.
@@ -33,8 +33,11 @@ class Settings:
     least_part: float = 0.9  # of the sample that is dielectric
     level: float = 0.03  # of the lights' strength in each colour, that is not told
     roughness: float = 1 / 3  # of its variation within a material that is kept
-    parts: int = 64  # a side, whose means tell whether there is a texture
-    contrast: tuple[float, float] = (0.03, 0.003)  # of plain samples' means: of k_d, and at least
+    side: int = 256  # pixels a side of which neighbours are compared
+    contrast: tuple[float, float] = (0.03, 0.003)  # they share on plain samples: of k_d; at least
+    alone: float = (
+        0.4  # of what a pixel varies by, that counts beside it: a weave's neighbours differ
+    )
 
 
 PLAIN_SETTINGS = Settings()
@@ -68,11 +71,13 @@ def evened(theta: Array, s: Settings = PLAIN_SETTINGS) -> Array:
         return theta
     uneven = theta[..., R] - material_means(theta, theta[..., R])
     mean = _mean(theta[..., D], weight)
-    size = tuple(min(s.parts, n) for n in weight.shape)
-    variance = float(np.mean((resize(theta[..., D], *size) - mean) ** 2))
+    size = tuple(min(s.side, n) for n in weight.shape)
+    varied = resize(theta[..., D], *size) - np.float32(mean)
+    rows, columns = varied[1:] * varied[:-1], varied[:, 1:] * varied[:, :-1]
+    shared = max((rows.mean() + columns.mean()) / 2, s.alone**2 * np.mean(varied**2), TINY)
     of, least = s.contrast
     plain = (of * mean.mean()) ** 2 + least**2
-    noise = min(1.0, plain / (variance + TINY)) ** 2
+    noise = min(1.0, plain / float(shared)) ** 2
     theta[..., D] -= noise * weight[..., None] * (theta[..., D] - np.float32(mean))
     theta[..., R] -= (1 - s.roughness) * weight * uneven
     return project(theta)
