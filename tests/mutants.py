@@ -26,10 +26,12 @@ TESTS = Path("tests/unit/refine")
 OWN = {
     "groups": ("test_groups.py", "test_shared.py"),
     "mirrors": ("test_mirrors.py",),
+    "plain": ("test_plain.py",),
     "posterior": ("test_posterior.py",),
     "several": ("test_several.py", "test_refine.py"),
     "shared": ("test_shared.py",),
     "shared_roughness": ("test_several.py",),
+    "texture": ("test_texture.py",),
 }
 REST = ("test_refine.py", "test_posterior.py")  # tests of the other modules
 ALL = ("test_fixed_results.py", "test_numbers.py")  # of every module

@@ -35,9 +35,7 @@ class Settings:
     roughness: float = 1 / 3  # of its variation within a material that is kept
     side: int = 256  # pixels a side of which neighbours are compared
     contrast: tuple[float, float] = (0.03, 0.003)  # they share on plain samples: of k_d; at least
-    alone: float = (
-        0.4  # of what a pixel varies by, that counts beside it: a weave's neighbours differ
-    )
+    alone: float = 0.4  # of a pixel's own deviation, that counts too: a weave's neighbours differ
 
 
 PLAIN_SETTINGS = Settings()
@@ -74,7 +72,8 @@ def evened(theta: Array, s: Settings = PLAIN_SETTINGS) -> Array:
     size = tuple(min(s.side, n) for n in weight.shape)
     varied = resize(theta[..., D], *size) - np.float32(mean)
     rows, columns = varied[1:] * varied[:-1], varied[:, 1:] * varied[:, :-1]
-    shared = max((rows.mean() + columns.mean()) / 2, s.alone**2 * np.mean(varied**2), TINY)
+    pairs = (rows.sum() + columns.sum()) / max(rows.size + columns.size, 1)
+    shared = max(pairs, s.alone**2 * np.mean(varied**2), TINY)
     of, least = s.contrast
     plain = (of * mean.mean()) ** 2 + least**2
     noise = min(1.0, plain / float(shared)) ** 2

@@ -148,7 +148,7 @@ def _regress(
     y, *x = ([_differences(image @ axis, fill) for axis in axes] for image in (k, t, room))
     columns = [np.stack(both, 1) for both in zip(*x, strict=True)]
     turned = [[_differences(u, fill) for u in _turned(t @ axis)] for axis in axes]
-    noise = [float(np.mean(each**2)) + TINY for each in y]
+    noise = [float(each @ each) / max(each.size, 1) + TINY for each in y]
     for _ in range(s.rounds):
         hessian, gradient = np.diag([TINY, 1.0]), np.zeros(2)
         for each, column, v in zip(y, columns, noise, strict=True):

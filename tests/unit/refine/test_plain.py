@@ -11,7 +11,7 @@ from invrender.pattern.default import default_pattern
 from invrender.refine.estimate import Initial, explain_photos
 from invrender.refine.gauss_newton import Observation
 from invrender.refine.plain import PLAIN_SETTINGS, evened, keep_level
-from invrender.refine.priors import network_prior
+from invrender.refine.priors import Prior, network_prior
 from invrender.refine.theta import D, R, S, project, to_maps, to_theta
 from invrender.render.fast.estimator import Fast
 from invrender.render.scene import make_scene
@@ -140,3 +140,14 @@ def test_the_whole_refinement_does_both(renderer):
     (screen, room, _), *_ = result.factors
     both = renderer.scaled(screen, room).render(result.maps, 64).mean((0, 1))
     np.testing.assert_allclose(both, shown, rtol=0.002)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (2, 1), (3, 2)])
+def test_a_few_pixels_are_numbers(renderer, shape):
+    photo, prior = asked(renderer, 1.02)
+    few = tuple(slice(n) for n in shape)
+    start = Prior(prior.mean[few], prior.sigma[few], prior.correlation)
+    photo = replace(photo, photo=photo.photo[few])
+    initial = Initial(to_maps(start.mean), start, asked=0)
+    result, _ = explain_photos([photo], initial, 64, lambda s: None, lambda i, e: None)
+    assert all(np.isfinite(m).all() for m in (*vars(result.maps).values(), result.sigma))
