@@ -238,9 +238,10 @@ def measure(
         crops = [replace(c, place=np.eye(3)) for c in crops]
     _, result, _ = estimate_maps(crops, stages, networks=networks)
     cpu = time.process_time() - cpu
-    capture: Capture = found[0].capture
+    k = next(i for i in range(len(told)) if i not in result.left_out)  # whose frame the maps have
+    capture: Capture = told[k].capture
     assert capture.truth is not None
-    truth, part = shown_part(resize_maps(capture.truth, size, size), told[0], folders[0])
+    truth, part = shown_part(resize_maps(capture.truth, size, size), told[k], folders[k])
     maps = crop_maps(result.maps, *part)
     truth = crop_maps(truth, *part)
     return {

@@ -15,7 +15,7 @@ from invrender.maps import Maps
 from invrender.render import brdf
 from invrender.render.backend import BACKEND, dr
 from invrender.rig import Rig, fov_of
-from invrender.sphere import mitsuba_rows
+from invrender.sphere import mitsuba_rows, solid_angles
 from invrender.types import Array, Vec3
 
 import mitsuba as mi  # isort: skip  (after the back end has chosen its LLVM)
@@ -253,9 +253,10 @@ def scene_dict(maps: Maps, lights: Lights, *, samples: int = 64) -> dict[str, An
 
     Its BSDF is ours, a plugin that this module registers, whose maps are parameters that carry
     gradients (``sample.bsdf.diffuse`` and so on). Its sensor sees what `invrender.render` renders:
-    the sample alone, from the camera, a pixel a texel.
+    the sample alone, from the camera, a pixel a texel. A lamp that is near is a sphere.
     """
     rig, (height, width) = lights.rig, maps.shape
+    room, lamp = _room_and_lamp(lights)
     x, y, z = (float(c) for c in rig.camera)
     down = [np.array(c, float) for c in ([-1, 0, 0], [0, 1, 0], [0, 0, -1], [x, y, z])]
     return {
@@ -277,8 +278,28 @@ def scene_dict(maps: Maps, lights: Lights, *, samples: int = 64) -> dict[str, An
             "sampler": {"type": "multijitter", "sample_count": samples},
         },
         "sample": _sample(rig, maps),
-        **_lights(rig, lights.pattern, lights.environment, lights.gain, lights.device),
+        **_lights(rig, lights.pattern, room, lights.gain, lights.device),
+        **_lamp(lamp),
     }  # fmt: skip
+
+
+def _room_and_lamp(lights: Lights) -> tuple[Array, Lamp | None]:
+    """The environment without the lamp that is near, and the even sphere that gives the same light
+    where the environment shows the lamp from, and is as large there."""
+    if lights.near is None:
+        return lights.environment, None
+    share = lights.near.share[..., None]
+    light = lights.environment * share * solid_angles(*share.shape[:2])[:, None, None]
+    flux = light.sum((0, 1), dtype=np.float64)
+    # Of an even disc it is the solid angle, and soft borders count by their share.
+    spread = float((light * lights.environment * share).sum(dtype=np.float64))
+    if spread == 0:
+        return lights.environment, None
+    solid_angle = min(float(flux @ flux) / spread, np.pi)
+    distance = np.linalg.norm(np.subtract(lights.near.place, lights.near.seen_from))
+    radius = float(distance * np.sqrt(1 - (1 - solid_angle / (2 * np.pi)) ** 2))
+    r, g, b = (float(c) for c in flux / solid_angle)
+    return lights.environment * (1 - share), (lights.near.place, radius, (r, g, b))
 
 
 def _sample(rig: Rig, maps: Maps, relief: Array | None = None) -> Any:

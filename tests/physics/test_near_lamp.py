@@ -12,8 +12,9 @@ from invrender.maps import NAMES, Estimate
 from invrender.refine.gauss_newton import linearise
 from invrender.refine.theta import to_theta
 from invrender.render.fast.estimator import Fast
+from invrender.render.image import render
 from invrender.render.near import renderer_under
-from invrender.render.path_traced import path_traced, sample_scene
+from invrender.render.path_traced import mi, path_traced, sample_scene, scene_dict
 from invrender.report.report import Report
 from invrender.report.result import Result
 from invrender.rig import Rig
@@ -52,6 +53,17 @@ def test_each_point_sees_it_where_it_is(maps):
         for n in (True, False)
     )
     assert near < 0.02 * truth.mean() < 0.2 * far
+
+
+def test_mitsubas_description_has_it(maps):
+    """Also under a camera off its place, as a result's lights are."""
+    lights = replace(lights_with(PLACE), rig=replace(RIG, camera_shift=(0.004, -0.006, 0.01)))
+    image = np.array(mi.render(mi.load_dict(scene_dict(maps, lights, samples=1024))))
+    near, far = (render(maps, x) for x in (lights, replace(lights, near=None)))
+    # Mitsuba averages over a pixel, ours is at its centre.
+    off, without = (np.abs(image - x).mean() for x in (near, far))
+    assert off < 0.012 * near.mean() and off < 0.2 * without, (off, without, near.mean())
+    assert image.mean() == pytest.approx(near.mean(), rel=0.01)
 
 
 def test_its_jacobian_is_that_of_differences(maps):
