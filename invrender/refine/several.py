@@ -152,12 +152,14 @@ def _calibrate(
     doubts = [factor_deviations(p.observation)[0] for p in photos.values()]
     spread = np.array([min(s.exposure, d) ** 2 for d in doubts])[:, None]
     logs *= spread / (spread + s.exposure_found**2)
-    out = []
-    for photo, own, log in zip(photos.values(), scatter, logs, strict=True):
+    exposed = []
+    for photo, log in zip(photos.values(), logs, strict=True):
         o = photo.observation
-        exposed = Observation(o.photo * np.exp(-log).astype(np.float32), o.renderer, o.clipped)
-        out.append(replace(Photo.of(exposed), noise=max(1.0, own)))
-    return out, [i for i in range(len(observations)) if i not in photos]
+        exposed.append(Photo.of(replace(o, photo=o.photo * np.exp(-log).astype(np.float32))))
+    point, _ = _small(exposed, theta, s.roughness, samples, s).solve(point.theta, s.tried)
+    scatter = np.maximum(noise_of(point.misfit, s), 1.0)
+    noisy = [replace(p, noise=float(own)) for p, own in zip(exposed, scatter, strict=True)]
+    return noisy, [i for i in range(len(observations)) if i not in photos]
 
 
 def _pool(photos: Sequence[Photo], theta: Array, sigma: Array, samples: int, s: Settings) -> Pooled:
