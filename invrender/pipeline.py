@@ -110,7 +110,10 @@ def prepare(
     stage = stage or Stages()
     check_count(len(folders), "the command")
     with stage("read"):
-        captures = [shown for folder in folders for shown in read_captures(folder)]
+        captures = []
+        for folder in folders:
+            captures += read_captures(folder)
+            check_count(len(captures), "the command")
     with stage("lights"):
         found = find_every_light(captures, known, stage.part("lights"))
     with stage("crop"):

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from invrender.data.environments import procedural_environment
 from invrender.data.materials import procedural_material
@@ -90,6 +91,17 @@ def test_a_photo_s_own_exposure_and_another_sample_are_found(truth, renderers, f
     initial, before, after = (map_errors(m, truth) for m in maps)
     assert after["normal"] < 0.5 * initial["normal"]
     assert after["average"] < 1.3 * before["average"] + 0.003
+
+
+def test_a_blurred_photo_does_no_harm(truth, renderers, found):
+    photos = photos_of(truth, renderers)
+    blurred = ndimage.gaussian_filter(photos[1].photo, (3, 3, 0))
+    photos[1] = replace(photos[1], photo=blurred)
+    before, after = (
+        map_errors(maps, truth)["average"]
+        for maps in (found.maps, explained(photos, as_a_network_errs(truth)).maps)
+    )
+    assert after < 1.25 * before
 
 
 @pytest.mark.parametrize("value", [0.0, 1e6])
