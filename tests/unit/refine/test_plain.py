@@ -81,9 +81,12 @@ def noisy(deviation, of=1, k_d=ALBEDO, k_s=0.04):
     return project(theta)
 
 
-@pytest.mark.parametrize(("deviation", "k_d"), [(0.04, ALBEDO), (0.3, np.float32([0.01] * 3))])
-def test_noise_of_a_plain_sample_goes(deviation, k_d):
-    theta = noisy(deviation, k_d=k_d)
+@pytest.mark.parametrize(
+    ("deviation", "of", "k_d"),
+    [(0.04, 1, ALBEDO), (0.03, 2, ALBEDO), (0.3, 1, np.float32([0.01] * 3))],
+)
+def test_noise_of_a_plain_sample_goes(deviation, of, k_d):
+    theta = noisy(deviation, of, k_d)
     before = theta[..., D].copy()
     after = evened(theta)[..., D]
     assert after.std((0, 1)).max() < 0.1 * before.std((0, 1)).min()

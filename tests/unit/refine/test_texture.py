@@ -1,5 +1,7 @@
 """Roughness by the light's pattern in the albedo: found where it stands there, else kept."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,7 @@ from invrender.maps import constant_maps
 from invrender.pattern.default import default_pattern
 from invrender.refine.gauss_newton import Observation, linearise
 from invrender.refine.priors import network_prior
-from invrender.refine.texture import _chosen, measure_light, without_light
+from invrender.refine.texture import TEXTURE_SETTINGS, _chosen, measure_light, without_light
 from invrender.refine.theta import D, R, S, to_maps, to_theta
 from invrender.render.fast.estimator import Fast
 from invrender.render.scene import make_scene
@@ -141,11 +143,23 @@ def test_a_room_in_doubt_is_no_roughness(renderer):
     for _ in range(2):
         image, jacobian = linearise(renderer, theta, 256)
         theta[..., D] += (photo - image) / jacobian[..., range(3), range(3)]
-    sure, unsure = (
-        measure_light(Observation(photo, renderer, None, doubt), theta, np.ones(maps.shape))
-        for doubt in ((0.0, 0.0), (0.0, 0.2))
+    sure, nearly, unsure = (
+        measure_light(Observation(photo, renderer, None, (0.0, doubt)), theta, np.ones(maps.shape))
+        for doubt in (0.0, 1e-3, 0.2)
     )
     assert abs(unsure.delta) < 0.5 * abs(sure.delta)
+    assert nearly.delta == pytest.approx(sure.delta, rel=0.02)
+
+
+def test_parts_of_two_sizes_tell_their_scatter(renderer):
+    few, many, both = (
+        measure_light(*_seen(renderer, sample(0.3, 0.6)), s=replace(TEXTURE_SETTINGS, parts=parts))
+        for parts in ((4,), (10,), (4, 10))
+    )
+    assert both.delta == pytest.approx((few.delta + many.delta) / 2)
+    scatter = (few.delta - many.delta) ** 2 / 4
+    assert both.variance == pytest.approx((few.variance + many.variance) / 2 + scatter)
+    assert scatter > 0.1 * few.variance
 
 
 def test_the_posterior_of_three_starts():
