@@ -23,7 +23,7 @@ from invrender.capture.near_lamp import find_near_lamp
 from invrender.capture.orientation import find_ball_and_orientation, not_the_pattern
 from invrender.capture.response import Response
 from invrender.capture.screen import Screen, fit_screen
-from invrender.capture.settings import PATTERN_CHECK, SCREEN_FIT, TABLE_LEVEL, UNFOLDING
+from invrender.capture.settings import DISPLAY, PATTERN_CHECK, SCREEN_FIT, TABLE_LEVEL, UNFOLDING
 from invrender.capture.sheet import FoundSheet, moved_circle, undone, use_paper, use_sheet
 from invrender.capture.table import lit_table
 from invrender.capture.vignetting import find_vignetting, without_vignetting
@@ -117,6 +117,7 @@ def find_lights(
         # The rim's tilt is kept only where the square of the sample shows none.
         unseen = sheet is None and found.camera_tilt is not None
         lights.fit["border_unseen"] = float(unseen)
+        lights.fit["curve_exponent"] = photo.curve_deviation / -math.log(DISPLAY.sample)
         capture = replace(capture, photo=photo.in_rec709())
     if environment is not None:
         lights = replace(lights, environment=environment)

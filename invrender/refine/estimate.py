@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from invrender.lights import Lights
 from invrender.maps import Maps
 from invrender.refine.flat import flat_maps
@@ -24,6 +26,7 @@ from invrender.refine.shared import light_doubt, share
 from invrender.refine.texture import without_light
 from invrender.refine.theta import to_maps, to_theta
 from invrender.render.near import renderer_under
+from invrender.rig import Rig
 from invrender.types import Array, Mask
 
 MEASURING_PHOTOS = 3  # photos from which these count for more than what networks know
@@ -47,7 +50,17 @@ class Initial:
 def observe(photo: Array, lights: Lights, clipped: Mask) -> Observation:
     """A photo of the sample with its forward model."""
     mask = clipped if clipped.any() else None
-    return Observation(photo, renderer_under(lights), mask, light_doubt(lights.fit), lights.lamps)
+    doubt, exponent = light_doubt(lights.fit), lights.fit.get("curve_exponent", 0.0)
+    away = lens_distance(lights.rig, *photo.shape[:2]) if lights.fit else None
+    return Observation(photo, renderer_under(lights), mask, doubt, lights.lamps, exponent, away)
+
+
+def lens_distance(rig: Rig, height: int, width: int) -> Array:
+    """Squared distance (H, W) of the sample's pixels from the middle of the photo, a corner's being
+    1 where that is 4 : 3."""
+    middle = np.array([4.0, 3.0]) / 2
+    at = rig.project(rig.sample_points(height, width), 3, 4)
+    return np.asarray(((at - middle) ** 2).sum(-1) / (middle**2).sum(), np.float32)
 
 
 def flat_start(photos: Sequence[Observation], samples: int) -> Initial:
@@ -113,4 +126,6 @@ def _explain_few(
     result.factors = [
         (level * screen, level * room, level * lamps) for screen, room, lamps in known.factors
     ]
+    if any(o.away is not None for o in photos):
+        result.seen = [o.photo for o in kept]
     return result, kept

@@ -47,6 +47,9 @@ class Observation:
     clipped (H, W): pixels that the photo does not measure; None where it measures all. doubt:
     deviations of the logarithms of the screen's and of the room's radiance; (0, 0) where the lights
     are known. lamps: as in `invrender.lights.Lights`, the light that the room's doubt is not about.
+    exponent: deviation of the power of light that the photo's values may still be, of a JPEG's tone
+    curve. away (H, W): squared distances from the photo's middle, of a corner's, for what a lens
+    takes of the light; None where that is known.
     """
 
     photo: Array
@@ -54,6 +57,8 @@ class Observation:
     clipped: NDArray[np.bool_] | None = None
     doubt: tuple[float, float] = (0.0, 0.0)
     lamps: Array | None = None
+    exponent: float = 0.0
+    away: Array | None = None
 
 
 @dataclass
@@ -61,7 +66,8 @@ class Refined:
     """Maps, their posterior standard deviations (H, W, 9) in the order of θ, how the fit went.
 
     interrupted: by Ctrl-C; the maps are the best so far. factors: of each photo's screen, room and
-    lamps, RGB, by which the lights were found to be off; empty where they were not fitted. Of
+    lamps, RGB, by which the lights were found to be off; seen: each photo without what was found of
+    its camera; both empty where they were not fitted. Of
     several photos that were explained together: left_out, which do not belong to the others;
     photo_errors, of each that does, the RMS of what the maps leave over its mean.
     """
@@ -72,6 +78,7 @@ class Refined:
     converged: bool = False
     interrupted: bool = False
     factors: list[tuple[Array, Array, Array]] = field(default_factory=list)
+    seen: list[Array] = field(default_factory=list)
     left_out: list[int] = field(default_factory=list)
     photo_errors: list[float] = field(default_factory=list)
 

@@ -7,7 +7,8 @@ a network's maps θ₀, weights w of the materials and the deviations S of what 
     θ = θ₀ + Σ_k w_k·S·z_k + e,
     photo ~ gain·I_screen(θ) + room·I_room(θ) + lamps·I_lamps(θ) + noise;
 
-unknowns are z, (materials, 7), and the logarithms of gain, room and lamps of each photo, RGB. They
+unknowns are z, (materials, 7), the logarithms of gain, room and lamps of each photo, RGB, and what
+its camera may still do: raise the light to a power, and lose some of it towards the corners. They
 are found by Gauss–Newton steps with each pixel's own e marginalised: the photo is compared by the
 means of parts of each material, whose expected spread J·Σ_e·Jᵀ + R includes e. What is far beyond
 it counts little (Student's t).
@@ -82,6 +83,7 @@ class Settings:
     lamp_doubt: float = 0.3  # of saturated lamps, whose brightness the table tells
     hidden_doubt: float = 0.1  # where a lamp behind the screen was added
     channels: float = 0.5  # of the lights' doubt, by which each colour may differ
+    corner: float = 0.1  # of the logarithm of the light in a photo's corner: lenses
     # the materials: groups of like sqrt(k_d), sqrt(f0) and ρ
     materials: int = 4
     mirror_weight: float = 1.5  # of sqrt(f0)
@@ -100,8 +102,9 @@ Factors = tuple[Array, Array, Array]  # of screen, room and lamps, RGB
 @dataclass(frozen=True)
 class Shared:
     """prior: with the maps as their materials are found to be. observations: with the lights as
-    they are found. factors: of each photo's screen, room and lamps, RGB. converged: the steps ended
-    by themselves. misfit: mean square of the parts' residuals over what is expected."""
+    they are found, the photos without what is found of their cameras. factors: of each photo's
+    screen, room and lamps, RGB. converged: the steps ended by themselves. misfit: mean square of
+    the parts' residuals over what is expected."""
 
     prior: Prior
     observations: list[Observation]
@@ -141,10 +144,29 @@ def share(
         o if o.doubt == KNOWN else replace(o, renderer=_scaled(o, *f))
         for o, f in zip(observations, factors, strict=True)
     ]
+    for i, camera in problem.camera.items():
+        shots[i] = replace(shots[i], photo=_without_camera(shots[i], *solved.u[camera]))
     return Shared(
         replace(prior, mean=theta, total=total), shots, factors,
         solved.converged, solved.misfit, solved.interrupted,
     )  # fmt: skip
+
+
+def _with_camera(image: Array, away: Array, exponent: float, loss: float) -> tuple[Array, Array]:
+    """A photo (H, W, 3) of an image as a camera makes it, about the image's median; and its
+    derivatives by ``exponent`` and by ``loss`` (H, W, 3, 2)."""
+    log = np.log(image / max(float(np.median(image)), TINY))
+    lost = np.broadcast_to(away[..., None], image.shape)
+    photo = image * np.exp(exponent * log - loss * lost)
+    return photo, photo[..., None] * np.stack([log, -lost], -1)
+
+
+def _without_camera(o: Observation, exponent: float, loss: float) -> Array:
+    """An observation's photo as it was before its camera did that."""
+    assert o.away is not None
+    photo = np.maximum(o.photo, 0) * np.exp(loss * o.away[..., None])
+    middle = max(float(np.median(photo)), TINY)
+    return np.asarray(middle * (photo / middle) ** (1 / (1 + exponent)), np.float32)
 
 
 def _scaled(o: Observation, screen: Any, room: Any, lamps: Any) -> Renderer:
@@ -258,7 +280,8 @@ def parts_of(height: int, width: int, s: Settings = SHARED_SETTINGS) -> Any:
 
 class _Problem:
     """The unknowns u: z of each material, then the logarithms of the lights' factors of each
-    doubtful photo: screen and room (6), and the lamps where there are any (9)."""
+    doubtful photo: screen and room (6), and the lamps where there are any (9); then the exponent
+    and the loss of each photo whose camera is not known."""
 
     def __init__(
         self, observations: Sequence[Observation], prior: Prior, theta: Array, centres: Array,
@@ -305,6 +328,12 @@ class _Problem:
             if fewer:
                 self.light[i] = slice(self.size, self.size + 3 * (1 + len(fewer)))
                 self.size = self.light[i].stop
+        self.camera: dict[int, slice] = {}
+        for i, o in enumerate(observations):
+            if o.away is not None:
+                self.camera[i] = slice(self.size, self.size + 2)
+                self.size = self.camera[i].stop
+        self.away = [None if o.away is None else o.away[at] for o in observations]
         self.precision = np.linalg.inv(self._covariance())
 
     def _covariance(self) -> Array:
@@ -321,6 +350,9 @@ class _Problem:
                 at = slice(k, k + 3)
                 each = np.eye(3) * s.channels**2
                 covariance[at, at] = max(sigma, 1e-4) ** 2 * (1 + each)
+        for i, camera in self.camera.items():
+            exponent = max(self.observations[i].exponent, 1e-4)
+            covariance[camera, camera] = np.diag([exponent**2, self.s.corner**2])
         return covariance
 
     def factors(self, u: Array) -> list[Factors]:
@@ -352,11 +384,11 @@ class _Problem:
         z = u[:n].reshape(-1, UNKNOWNS) * self.apparent
         theta[..., :UNKNOWNS] += self.shared * (self.weight @ z.astype(np.float32))
         theta = project(theta)
-        found = [self._photo(i, theta, f) for i, f in enumerate(self.factors(u))]
+        found = [self._photo(i, theta, f, u) for i, f in enumerate(self.factors(u))]
         residual, derivative, precision = (np.concatenate(x) for x in zip(*found, strict=True))
         return residual, derivative, precision
 
-    def _photo(self, i: int, theta: Array, factors: Factors) -> tuple[Array, ...]:
+    def _photo(self, i: int, theta: Array, factors: Factors, u: Array) -> tuple[Array, ...]:
         s, photo = self.s, self.photos[i]
         image, jacobian = linearise(self.observations[i].renderer, theta, self.samples)
         fewer = self.fewer[i]
@@ -371,6 +403,13 @@ class _Problem:
                 image += light
                 jacobian += derivative * factors[k][:, None]
                 lights[..., range(3), range(3 * k, 3 * k + 3)] = light
+        away = self.away[i]
+        if away is not None:
+            exponent, loss = u[self.camera[i]]
+            plain = np.maximum(image, TINY)
+            image, camera = _with_camera(plain, away, exponent, loss)
+            by = image / plain * (1 + exponent)
+            jacobian, lights = jacobian * by[..., None], lights * by[..., None]
         own = jacobian * self.own[..., None, :]
         noise = (s.noise[0] * photo) ** 2 + (s.noise[1] * photo.mean()) ** 2 + self.mixing[i]
         shared = jacobian[..., :UNKNOWNS] * self.shared[..., None, :]
@@ -386,6 +425,8 @@ class _Problem:
             derivative[..., at] = means(shared) * self.apparent[k]
             if fewer:
                 derivative[..., self.light[i]] = means(lights)
+            if away is not None:
+                derivative[..., self.camera[i]] = means(camera)
             a = means(own)
             spread = a @ self.correlation @ np.swapaxes(a, 1, 2)
             spread[:, range(3), range(3)] += means(noise)

@@ -45,13 +45,13 @@ def summarise(
 
     k = next(i for i in range(len(found)) if i not in refined.left_out)
     first, lights, capture = crops[k], found[k].lights, found[k].capture
-    size = len(first.photo)
+    photo, size = refined.seen[0] if refined.seen else first.photo, len(first.photo)
     # The second is kept; of the first, and of many pixels, only the error matters.
     counts = ((start, samples), (refined.maps, SAMPLES if size <= FINE else samples))
     pictures = [renderer.render(maps, count) for maps, count in counts]
-    before, after = (photo_error(p, first.photo, first.clipped) for p in pictures)
+    before, after = (photo_error(p, photo, first.clipped) for p in pictures)
     baked = baked_light(refined.maps.diffuse, renderer, samples)
-    coarse = coarse_error(pictures[1], first.photo, first.clipped)
+    coarse = coarse_error(pictures[1], photo, first.clipped)
     notices = map_notices(lights, first.clipped, refined, init, baked, coarse)
     names = [f.capture.name for f in found]
     left_out = [names[i] for i in refined.left_out]
@@ -87,7 +87,7 @@ def summarise(
     )
     estimate = with_mirror_error(Estimate(refined.maps, deviations(refined.sigma)), lights)
     seen = lights.scaled(*refined.factors[0]) if refined.factors else lights
-    return Result(estimate, seen, first.photo, report, pictures[1])
+    return Result(estimate, seen, photo, report, pictures[1])
 
 
 def with_mirror_error(estimate: Estimate, lights: Lights) -> Estimate:

@@ -152,6 +152,31 @@ def test_doubtful_room_is_found(renderer):
     assert np.abs(shown - photo).mean() < 0.2 * np.abs(renderer.render(truth) - photo).mean()
 
 
+@pytest.mark.parametrize(("exponent", "loss"), [(-0.1, 0.0), (0.08, 0.0), (0.0, 0.15)])
+def test_what_a_camera_does_is_found(renderer, exponent, loss):
+    """A JPEG's power of light, and a lens that darkens the corners: not believed to be roughness
+    or texture, and undone."""
+    maps = textured(constant_maps(SIZE, SIZE, (0.5, 0.3, 0.2), 0.04, 0.3), 0.05)
+    light = renderer.render(maps)
+    away = np.add.outer(np.linspace(0, 0.5, SIZE), np.linspace(0, 0.5, SIZE)).astype(np.float32)
+    middle = np.median(light)
+    photo = middle * (light * np.exp(-loss * away[..., None]) / middle) ** (1 + exponent)
+    prior = prior_of(maps, roughness=0.1)
+    off, known = (
+        share([Observation(photo.astype(np.float32), renderer, **camera)], prior)
+        for camera in ({}, {"exponent": 0.15, "away": away})
+    )
+
+    def error(shared):
+        return map_errors(to_maps(shared.prior.mean), maps)["roughness"]
+
+    def contrast(shared):
+        return np.log(shared.observations[0].photo / light).std()
+
+    assert error(known) < 0.5 * error(off)
+    assert contrast(known) < 0.5 * contrast(off)
+
+
 def test_doubtful_lamps_are_found(renderer):
     """The room beside them is not brighter, and nothing passes for a narrower lobe."""
     truth = textured(constant_maps(SIZE, SIZE, (0.4, 0.3, 0.2), 0.04, 0.5))
