@@ -365,8 +365,8 @@ def main(args: argparse.Namespace) -> None:
         cpu = time.process_time()
         found = [find(folder, [], -1)[0] for folder in lit]
         judge(found, (time.process_time() - cpu) / len(lit), lit, NO_TABLET)
-    share = float(np.mean(recognised))
-    content = {"rows": results, "recognised": share, "bars": bars(results, share)}
-    args.out.mkdir(parents=True, exist_ok=True)
-    plot(results, args.out / "several.png")
-    write_results(args.out, content, {"errors over those of one photo": error_table(results)})
+        # A run that is stopped leaves what it has.
+        share = float(np.mean(recognised))
+        content = {"rows": results, "recognised": share, "bars": bars(results, share)}
+        plot(results, args.out / "several.png")
+        write_results(args.out, content, {"errors over those of one photo": error_table(results)})
