@@ -46,6 +46,7 @@ from nets.store import load_weights
 from nets.training.draw import (
     SPLITS,
     Options,
+    draw_built_rigs,
     draw_environment,
     draw_material,
     draw_rigs,
@@ -59,6 +60,7 @@ from nets.training.noise import (
     draw_devices,
     draw_pattern,
     fit_gain,
+    lens_and_curve,
     mirror_error,
     sensor,
 )
@@ -74,7 +76,8 @@ FLOOR = 1e-4  # smallest white level of a usable capture, of the screen's white
 
 def make_group(rng: np.random.Generator, options: Options) -> list[Sample]:
     """``per_room`` captures in one room with one rig. Fewer if some come out degenerate."""
-    known, true = draw_rigs(rng)
+    built = rng.random() < options.built
+    known, true = draw_built_rigs(rng) if built else draw_rigs(rng)
     pattern = draw_pattern(rng, light_pattern(options.pattern))
     found, device = draw_devices(rng)
     shown = display(rng, device.shown(pattern))
@@ -111,7 +114,7 @@ def make_group(rng: np.random.Generator, options: Options) -> list[Sample]:
         parts = [p.radiance(view, material, options.samples) for p in (room, *screens)]
         dr.eval(parts)
         a, b, c = (np.asarray(p).T.reshape(size, size, 3) for p in parts)
-        photo = sensor(rng, a + b)
+        photo = sensor(rng, lens_and_curve(rng, a + b, true))
         sample = {"photo": photo, "ideal": a + c, **lights}
         if all(np.isfinite(v).all() for v in sample.values()):
             packed = _pack(sample, unit, maps)
@@ -221,8 +224,8 @@ def check_options(options: Options) -> None:
     """Raise `InputError` for what no worker could use, before any starts."""
     if min(options.size, options.samples, options.per_room) < 1 or options.env_height < 2:
         raise InputError("sizes, samples and captures a room must be positive")
-    if not 0 <= options.procedural <= 1:
-        raise InputError("--procedural is a share between 0 and 1")
+    if not (0 <= options.procedural <= 1 and 0 <= options.built <= 1):
+        raise InputError("--procedural and --built are shares between 0 and 1")
     in_fold("", options.fold)
     light_pattern(options.pattern)
     if options.network:

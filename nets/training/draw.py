@@ -25,6 +25,7 @@ from invrender.data.materials import (
     mix,
     procedural_material,
 )
+from invrender.data.simulate_setup import draw_setup
 from invrender.files.images import read_image
 from invrender.maps import Maps
 from invrender.pattern.default import default_pattern
@@ -57,6 +58,7 @@ class Options:
 
     procedural: share of made-up materials and rooms where folders are given. per_room: captures in
     the same room with the same rig. pattern: an image file, or the default pattern where empty.
+    built: share of rooms whose rig is one of those that people build (`draw_built_rigs`).
     network: weights; where given, captures are not for that network but for the correction of its
     maps (`nets.correction`). fold: "K/N", for cross-fitting: of N parts into which the training
     materials fall by family, only part K; "-K/N", all but part K.
@@ -72,6 +74,7 @@ class Options:
     per_room: int = 2
     env_height: int = 64
     pattern: str = ""
+    built: float = 0.6
     network: str = ""
     fold: str = ""
 
@@ -196,7 +199,7 @@ def draw_environment(rng: np.random.Generator, options: Options) -> Array:
 
 
 def draw_rigs(rng: np.random.Generator) -> tuple[Rig, Rig]:
-    """(what the user measured or the ball showed, what it really is).
+    """(what the user measured or the ball showed, what it really is), of the default's proportions.
 
     Only proportions matter to the picture, so the screen's size stays. Some rigs are held by hand:
     shifted by up to a tenth of the sample and tilted by up to 10 degrees, and known to be.
@@ -213,17 +216,30 @@ def draw_rigs(rng: np.random.Generator) -> tuple[Rig, Rig]:
         shift = loose * 0.1 * d.sample_size * rng.uniform(-1, 1, 3) * (1, 1, 0.5)
         tilt = loose * 10 * rng.uniform(-1, 1, 3)
         known = replace(known, screen_shift=_vec3(shift), screen_tilt=_vec3(tilt))
+    return known, _mistaken(rng, known)
+
+
+def draw_built_rigs(rng: np.random.Generator) -> tuple[Rig, Rig]:
+    """The same of rigs as people build them (`invrender.data.simulate_setup.RANGES`): displays of
+    several sizes and proportions, held lower or higher, the camera anywhere above, small samples.
+    """
+    known = draw_setup(int(rng.integers(2**31))).rig
+    return known, _mistaken(rng, known)
+
+
+def _mistaken(rng: np.random.Generator, known: Rig) -> Rig:
+    """What a rig that is believed to be ``known`` really is: three in ten are just that, the others
+    a few millimetres and up to a degree off."""
     if rng.random() < 0.3:
-        return known, known
+        return known
     wrong = float(rng.uniform(0, 1))
     shift, tilt, camera = wrong * rng.standard_normal((3, 3)) * [[0.0015], [0.6], [0.0015]]
-    true = replace(
+    return replace(
         known,
         screen_shift=_vec3(shift + known.screen_shift),
         screen_tilt=_vec3(tilt + known.screen_tilt),
-        camera_shift=_vec3(camera),
+        camera_shift=_vec3(camera + known.camera_shift),
     )
-    return known, true
 
 
 def _vec3(v: Array) -> tuple[float, float, float]:

@@ -12,6 +12,7 @@ from scipy.ndimage import gaussian_filter, zoom
 
 from invrender.data.simulate_setup import RANGES
 from invrender.lights import IDEAL, Device
+from invrender.rig import Rig
 from invrender.sphere import resample_environment
 from invrender.types import Array
 from nets.splitsum import area_resize
@@ -19,12 +20,15 @@ from nets.splitsum import area_resize
 # Of displays as they are: the share of captures that have one. Standard deviations of what is found
 # of its falloff's exponent, and of each share of its mixing; of the logarithm of the reflectance
 # that a ball is believed to have, and of each channel's; of the shoulder that is left when a JPEG's
-# tone curve is undone. By hand: the estimates' own errors are to be put here when
-# `python -m benchmarks device` has measured them.
+# tone curve is undone, and of the exponent where that is done badly; the shares of photos with such
+# a curve, and with a lens whose dark corners nobody has undone. By hand, near what the captures of
+# `python -m benchmarks device` have (docs/research-log/2026-11-30-what-is-left-of-a-camera.md).
 REAL_DISPLAYS = 0.5
 FALLOFF_ERROR, MIXING_ERROR = 0.1, 0.005
 MIRROR_ERROR, MIRROR_TINT = 0.03, 0.01
 TONED, SHOULDER_ERROR = 0.3, 0.05  # the share of photos first
+BADLY_TONED, EXPONENT_ERROR = 0.4, 0.12
+VIGNETTED, DARKEST_CORNER = 0.5, 0.2
 
 
 def draw_devices(rng: np.random.Generator) -> tuple[Device, Device]:
@@ -112,6 +116,17 @@ def captured_environment(rng: np.random.Generator, env: Array, white: float) -> 
     return resample_environment(seen.astype(np.float32), 64)
 
 
+def lens_and_curve(rng: np.random.Generator, image: Array, rig: Rig) -> Array:
+    """Radiance (H, W, 3) as some cameras have it still when everything known was undone: darker
+    towards the photo's corners, and raised to a power."""
+    if rng.random() < VIGNETTED:
+        image = image * _corners(rig, *image.shape[:2], rng.uniform(0, DARKEST_CORNER))[..., None]
+    if rng.random() < BADLY_TONED:
+        middle = max(float(np.median(image)), 1e-8)
+        image = middle * (image / middle) ** (1 + EXPONENT_ERROR * rng.standard_normal())
+    return image
+
+
 def sensor(rng: np.random.Generator, image: Array) -> Array:
     """A camera's noise, blur, clipping and tone curve on radiance (H, W, 3)."""
     if rng.random() < 0.5:
@@ -127,3 +142,13 @@ def sensor(rng: np.random.Generator, image: Array) -> Array:
         k = max(SHOULDER_ERROR * rng.standard_normal(), -0.5)
         x = (1 + k) * x / (1 + k * x)
     return (x * top).astype(np.float32)
+
+
+def _corners(rig: Rig, height: int, width: int, loss: float) -> Array:
+    """The sample's light (H, W) through a lens that takes a share ``loss`` in the photo's corners,
+    whose middle is where the camera looks straight down."""
+    away = rig.sample_points(height, width)[..., :2] - rig.camera[:2]
+    corner = rig.camera[2] * np.tan(np.radians(rig.fov / 2)) * 1.25  # of a photo of 4 : 3
+    r2 = np.minimum((away**2).sum(-1) / corner**2, 1)
+    c = 1 / np.sqrt(1 - loss) - 1
+    return np.asarray(1 / (1 + c * r2) ** 2)

@@ -261,6 +261,29 @@ def test_display_and_sensor_noise_are_small_and_seeded():
     assert data.capture_pattern(rng, shown).shape == (64, 64, 3)
 
 
+def test_built_rigs_are_of_many_proportions():
+    """Displays, heights and samples as people have them; what they really are is near by."""
+    rng = np.random.default_rng(0)
+    pairs = [draw.draw_built_rigs(rng) for _ in range(60)]
+    sizes = np.array([known.sample_size / min(known.screen_sides) for known, _ in pairs])
+    heights = np.array([known.screen_height / max(known.screen_sides) for known, _ in pairs])
+    cameras = np.array([known.camera[2] / known.screen_height for known, _ in pairs])
+    assert np.ptp(sizes) > 0.1 and np.ptp(heights) > 0.2 and np.ptp(cameras) > 0.5
+    off = np.array([np.subtract(k.camera, t.camera) for k, t in pairs])
+    assert 8 < (off == 0).all(1).sum() < 30 and 0 < np.abs(off).max() < 0.01
+
+
+def test_lens_darkens_away_from_where_it_looks_and_a_curve_keeps_the_order():
+    rig, image = draw.draw_rigs(np.random.default_rng(1))[0], np.full((16, 16, 3), 0.4)
+    lens = [noise.lens_and_curve(np.random.default_rng(k), image, rig) for k in range(40)]
+    slopes = np.array([x[:, -1].mean() / x[:, 0].mean() for x in lens])  # the camera is at +x
+    assert (slopes > 1 - 1e-9).all() and 10 < (slopes > 1.001).sum() < 30
+    ramp = np.linspace(0.1, 0.9, 16 * 16 * 3).reshape(16, 16, 3)
+    curves = [noise.lens_and_curve(np.random.default_rng(k), ramp, rig) for k in range(40)]
+    spans = [np.log(x[8, -1] / x[7, 0]).mean() for x in curves]
+    assert np.std(spans) > 0 and all(np.all(x > 0) for x in curves)
+
+
 def test_half_of_the_displays_are_real_and_nearly_known():
     """Found falloff and mixing are those of the display within their errors; white stays white."""
     rng = np.random.default_rng(0)
