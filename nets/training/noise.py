@@ -120,7 +120,8 @@ def lens_and_curve(rng: np.random.Generator, image: Array, rig: Rig) -> Array:
     """Radiance (H, W, 3) as some cameras have it still when everything known was undone: darker
     towards the photo's corners, and raised to a power."""
     if rng.random() < VIGNETTED:
-        image = image * _corners(rig, *image.shape[:2], rng.uniform(0, DARKEST_CORNER))[..., None]
+        height, width = image.shape[:2]
+        image = image * _corners(rig, height, width, rng.uniform(0, DARKEST_CORNER))[..., None]
     if rng.random() < BADLY_TONED:
         middle = max(float(np.median(image)), 1e-8)
         image = middle * (image / middle) ** (1 + EXPONENT_ERROR * rng.standard_normal())
