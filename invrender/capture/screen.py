@@ -101,11 +101,14 @@ def fit_screen(
         u = fit.start()
         for blurred, least in SCREEN_FIT.stages[first:]:
             u = fit.solve(u, blurred * max(1.0, fit.radius / SCREEN_FIT.stage_radius), least)
-        better = u[_FALLOFF] >= 0 and fit.cost(start) - fit.cost(u) > SCREEN_FIT.better
+        better = fit.cost(start) - fit.cost(u) > SCREEN_FIT.better
+        result = fit.result(u)
+        # Few pixels that nothing contradicts fit best of all, with a display like no other.
+        likely = 0 <= u[_FALLOFF] <= DISPLAY.greatest_falloff
+        likely &= result.pixels > SCREEN_FIT.least_part * ideal.pixels
         # A screen far off has another room behind it, under which the nominal one may look worse.
-        residual = fit.result(u).residual
-        if better and residual < (found[0] if found else ideal.residual):
-            found = residual, dims, u
+        if better and likely and result.residual < (found[0] if found else ideal.residual):
+            found = result.residual, dims, u
         if found and (dims or found[0] < SCREEN_FIT.good):
             break
     if found:

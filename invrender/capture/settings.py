@@ -417,6 +417,7 @@ class ScreenFit:
     inside: float = 0.98  # share of the screen in a pixel that lies on it; by hand
     outside: float = 0.003  # share of the screen in a pixel beside it; by hand
     least_inside: int = 12  # pixels on the screen; by hand
+    least_part: float = 0.4  # of those of the nominal screen, that it has elsewhere; by hand
     room_window: int = 5  # pixels, of the room's mean and spread; by hand
     room_spread: float = 0.1  # of the room's radiance, at least; by hand
     room_margin: float = 2.0  # pixels, and as many for each of blur; by hand
@@ -438,6 +439,7 @@ class Display:
     `invrender.capture.screen`. Deviations about nought."""
 
     falloff_deviation: float = 1.0  # of the exponent; measured displays have 0.3 to 1.6
+    greatest_falloff: float = 3.0  # of any; by hand
     black_deviation: float = 0.01  # relative to white; by hand
     mixing_deviation: float = 0.05  # of a channel's light in another; measured: 0.01 to 0.09
     # Of the logarithm of the display's gamma; measured displays have gammas of 0.92 to 1.12.
