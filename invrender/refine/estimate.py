@@ -23,13 +23,17 @@ from invrender.refine.posterior import explain
 from invrender.refine.priors import Prior, lobe_prior
 from invrender.refine.several import explain_together, plain_prior
 from invrender.refine.shared import light_doubt, share
-from invrender.refine.texture import without_light
-from invrender.refine.theta import to_maps, to_theta
+from invrender.refine.texture import TEXTURE_SETTINGS, without_light
+from invrender.refine.theta import dielectric_share, to_maps, to_theta
 from invrender.render.near import renderer_under
 from invrender.rig import Rig
 from invrender.types import Array, Mask
 
 MEASURING_PHOTOS = 3  # photos from which these count for more than what networks know
+# Of `Shared.misfit`, from which the lights on dielectrics are wrong, such as the edge of a shadow:
+# of 70 photographs it is below 0.1, of one with its screen's shadow elsewhere 2.1; of a mirror 3.5
+# (docs/research-log/2026-11-30-a-shadow-elsewhere.md).
+CONTRADICTED = 0.5
 
 
 @dataclass(frozen=True)
@@ -118,6 +122,9 @@ def _explain_few(
         result.factors = known.factors
         return result, known.observations
     start = initial.maps
+    plain = dielectric_share(known.prior.mean).mean() > TEXTURE_SETTINGS.least_part
+    if plain and known.misfit > CONTRADICTED:  # what pixels say is what the lights are off by
+        return Refined(start, initial.prior.expected, converged=True), list(photos)
     prior = without_light(known.observations, known.prior, start.roughness, samples=samples)
     kept, prior, level = keep_level(known.observations, prior, start.diffuse)
     result = explain(kept, prior, samples=samples)

@@ -1,11 +1,14 @@
 """What materials share and what lights are off by: found where the photo tells it, else kept."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from invrender.data.environments import procedural_environment
 from invrender.maps import constant_maps, map_errors
 from invrender.pattern.default import block_pattern
+from invrender.refine.estimate import Initial, explain_photos
 from invrender.refine.gauss_newton import Observation
 from invrender.refine.priors import network_prior
 from invrender.refine.shared import (
@@ -175,6 +178,19 @@ def test_what_a_camera_does_is_found(renderer, exponent, loss):
 
     assert error(known) < 0.5 * error(off)
     assert contrast(known) < 0.5 * contrast(off)
+
+
+@pytest.mark.parametrize("shadow", [1.0, 0.2])
+def test_a_shadow_that_the_lights_do_not_have_is_no_material(renderer, shadow):
+    """Where all parts together contradict the lights, a dielectric keeps its first maps."""
+    maps = constant_maps(SIZE, SIZE, 0.7, 0.04, 0.6)
+    photo = renderer.render(maps)
+    photo[:, SIZE // 2 :] *= shadow
+    first = replace(maps, roughness=maps.roughness + 0.03)
+    initial = Initial(first, prior_of(first), asked=0)
+    found, _ = explain_photos([Observation(photo, renderer)], initial, 64, print, print)
+    moved = np.abs(found.maps.diffuse - first.diffuse).max() > 0
+    assert moved == (shadow == 1)
 
 
 def test_doubtful_lamps_are_found(renderer):
