@@ -30,6 +30,19 @@ def fov_of(tangent: float) -> float:
     return math.degrees(2 * math.atan(tangent))
 
 
+def squared_distance(pixels: Array, height: float, width: float) -> Array:
+    """That of pixels (..., 2) from the middle of a photo of that size, 1 in the corners."""
+    half = np.array([width, height]) / 2
+    return np.asarray(((pixels - half) ** 2).sum(-1) / (half**2).sum())
+
+
+def lens_gain(share: float, aside: Array) -> Array:
+    """By what radiance must be multiplied where a lens's corners lack a ``share`` of the light, at
+    squared distances ``aside`` from the middle: (1 + c·r²)², as the fourth power of a cosine falls.
+    """
+    return np.asarray((1 + (1 / np.sqrt(1 - share) - 1) * aside) ** 2)
+
+
 @dataclass(frozen=True)
 class Rig:
     """Sizes in metres, angles in degrees. The defaults are a tablet and a 19 mm ball.
@@ -130,6 +143,11 @@ class Rig:
         points = np.zeros((height, width, 3))
         points[..., 0], points[..., 1] = x[None, :], y[:, None]
         return points
+
+    def lens_distance(self, height: int, width: int) -> Array:
+        """`squared_distance` (H, W) of the sample's pixels in a photo of 4 : 3."""
+        at = self.project(self.sample_points(height, width), 3, 4)
+        return squared_distance(at, 3, 4)
 
     # --- the screen -----------------------------------------------------------------------------
 

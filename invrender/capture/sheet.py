@@ -32,11 +32,10 @@ from invrender.capture.sheet_layout import (
     marker_dictionary,
 )
 from invrender.capture.table import room_irradiance, screen_irradiance
-from invrender.capture.vignetting import lens_gain, squared_distance
 from invrender.files.capture import Capture
 from invrender.files.images import Photo
 from invrender.lights import Lights
-from invrender.rig import Rig, fov_of
+from invrender.rig import Rig, fov_of, lens_gain, squared_distance
 from invrender.sphere import resample_environment
 from invrender.types import TINY, Array, InputError, Mask, Notice
 
@@ -189,7 +188,7 @@ def use_sheet(capture: Capture) -> tuple[Capture, FoundSheet | None, tuple[Notic
         white=_on_table(white),
         white_radiance=radiance,
         white_aside=squared_distance(
-            photo, posed.project(_on_table(white), photo.height, photo.width)
+            posed.project(_on_table(white), photo.height, photo.width), photo.height, photo.width
         ),
         turns=turns,
     )

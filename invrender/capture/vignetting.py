@@ -2,7 +2,7 @@
 
 The light on the table is known once the lights are, up to its albedo. Where its radiance falls off
 from the photo's middle more than that light does, and nothing else is left to explain, the lens is
-the cause: a factor 1/(1 + c·r²)², with r = 1 in the corners, as the fourth power of a cosine falls.
+the cause (`invrender.rig.lens_gain`).
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from invrender.capture.robust import spread
 from invrender.capture.settings import TABLE_METER, VIGNETTING
 from invrender.capture.table import LitTable, distant_pairs
 from invrender.files.images import Photo
-from invrender.rig import Rig
-from invrender.types import TINY, Array
+from invrender.rig import Rig, lens_gain, squared_distance
+from invrender.types import TINY
 
 
 def find_vignetting(photo: Photo, rig: Rig, table: Callable[[], LitTable]) -> float:
@@ -33,7 +33,7 @@ def find_vignetting(photo: Photo, rig: Rig, table: Callable[[], LitTable]) -> fl
     if not pairs:
         return 0.0
     albedo = (seen - np.log(np.maximum(lit + room, TINY))).mean(-1)
-    aside = squared_distance(photo, rig.project(at, photo.height, photo.width))
+    aside = squared_distance(rig.project(at, photo.height, photo.width), photo.height, photo.width)
 
     def spreads(v: float) -> float:
         log = albedo + np.log(lens_gain(v, aside))
@@ -47,24 +47,13 @@ def find_vignetting(photo: Photo, rig: Rig, table: Callable[[], LitTable]) -> fl
     return float(tried[best]) if told else 0.0
 
 
-def squared_distance(photo: Photo, pixels: Array) -> Array:
-    """That of pixels (..., 2) from the photo's middle, 1 in the corners."""
-    half = np.array([photo.width, photo.height]) / 2
-    return np.asarray(((pixels - half) ** 2).sum(-1) / (half**2).sum())
-
-
 def without_vignetting(photo: Photo, share: float) -> Photo:
     """The photo as brightened towards its corners, which lack a ``share`` of the light; what is
     saturated stays so."""
     if share == 0:
         return photo
     x, y = np.arange(photo.width) + 0.5, np.arange(photo.height) + 0.5
-    aside = squared_distance(photo, np.stack(np.broadcast_arrays(x, y[:, None]), -1))
+    pixels = np.stack(np.broadcast_arrays(x, y[:, None]), -1)
+    aside = squared_distance(pixels, photo.height, photo.width)
     image = photo.image * lens_gain(share, aside)[..., None]
     return replace(photo, image=image.astype(np.float32))
-
-
-def lens_gain(share: float, aside: Array) -> Array:
-    """By what radiance must be multiplied where a lens's corners lack a ``share`` of the light, at
-    squared distances ``aside`` from the middle."""
-    return np.asarray((1 + (1 / np.sqrt(1 - share) - 1) * aside) ** 2)

@@ -11,6 +11,7 @@ from PIL import Image
 from scipy import ndimage
 
 from invrender.colour import PRIMARIES, adaptation, linear_to_srgb, to_rec709, to_xyz, white_xyz
+from invrender.rig import lens_gain
 from invrender.types import Array
 
 WIDER = 1.04  # of the render, so that a barrel distortion finds something in the corners
@@ -67,9 +68,7 @@ def seen(camera: Camera, radiance: Array, height: int, width: int) -> Array:
             for c in np.moveaxis(radiance, -1, 0)
         ], -1)  # fmt: skip
     if camera.vignetting:
-        # 1/(1 + c r²)², as the fourth power of a cosine.
-        c = 1 / np.sqrt(1 - camera.vignetting) - 1
-        image = image / (1 + c * r2[..., None]) ** 2
+        image = image / lens_gain(camera.vignetting, r2)[..., None]
     if camera.blur:
         sigma = camera.blur * width / 1280
         image = ndimage.gaussian_filter(image, (sigma, sigma, 0))

@@ -26,7 +26,6 @@ from invrender.refine.shared import light_doubt, share
 from invrender.refine.texture import TEXTURE_SETTINGS, without_light
 from invrender.refine.theta import dielectric_share, to_maps, to_theta
 from invrender.render.near import renderer_under
-from invrender.rig import Rig
 from invrender.types import Array, Mask
 
 MEASURING_PHOTOS = 3  # photos from which these count for more than what networks know
@@ -55,16 +54,8 @@ def observe(photo: Array, lights: Lights, clipped: Mask) -> Observation:
     """A photo of the sample with its forward model."""
     mask = clipped if clipped.any() else None
     doubt, exponent = light_doubt(lights.fit), lights.fit.get("curve_exponent", 0.0)
-    away = lens_distance(lights.rig, *photo.shape[:2]) if lights.fit else None
+    away = lights.rig.lens_distance(*photo.shape[:2]).astype(np.float32) if lights.fit else None
     return Observation(photo, renderer_under(lights), mask, doubt, lights.lamps, exponent, away)
-
-
-def lens_distance(rig: Rig, height: int, width: int) -> Array:
-    """Squared distance (H, W) of the sample's pixels from the middle of the photo, a corner's being
-    1 where that is 4 : 3."""
-    middle = np.array([4.0, 3.0]) / 2
-    at = rig.project(rig.sample_points(height, width), 3, 4)
-    return np.asarray(((at - middle) ** 2).sum(-1) / (middle**2).sum(), np.float32)
 
 
 def flat_start(photos: Sequence[Observation], samples: int) -> Initial:

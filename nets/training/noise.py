@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter, zoom
 
 from invrender.data.simulate_setup import RANGES
 from invrender.lights import IDEAL, Device
-from invrender.rig import Rig
+from invrender.rig import Rig, lens_gain
 from invrender.sphere import resample_environment
 from invrender.types import Array
 from nets.splitsum import area_resize
@@ -120,8 +120,8 @@ def lens_and_curve(rng: np.random.Generator, image: Array, rig: Rig) -> Array:
     """Radiance (H, W, 3) as some cameras have it still when everything known was undone: darker
     towards the photo's corners, and raised to a power."""
     if rng.random() < VIGNETTED:
-        height, width = image.shape[:2]
-        image = image * _corners(rig, height, width, rng.uniform(0, DARKEST_CORNER))[..., None]
+        loss, aside = rng.uniform(0, DARKEST_CORNER), rig.lens_distance(*image.shape[:2])
+        image = image / lens_gain(loss, aside)[..., None]
     if rng.random() < BADLY_TONED:
         middle = max(float(np.median(image)), 1e-8)
         image = middle * (image / middle) ** (1 + EXPONENT_ERROR * rng.standard_normal())
@@ -143,13 +143,3 @@ def sensor(rng: np.random.Generator, image: Array) -> Array:
         k = max(SHOULDER_ERROR * rng.standard_normal(), -0.5)
         x = (1 + k) * x / (1 + k * x)
     return (x * top).astype(np.float32)
-
-
-def _corners(rig: Rig, height: int, width: int, loss: float) -> Array:
-    """The sample's light (H, W) through a lens that takes a share ``loss`` in the photo's corners,
-    whose middle is where the camera looks straight down."""
-    away = rig.sample_points(height, width)[..., :2] - rig.camera[:2]
-    corner = rig.camera[2] * np.tan(np.radians(rig.fov / 2)) * 1.25  # of a photo of 4 : 3
-    r2 = np.minimum((away**2).sum(-1) / corner**2, 1)
-    c = 1 / np.sqrt(1 - loss) - 1
-    return np.asarray(1 / (1 + c * r2) ** 2)

@@ -9,15 +9,10 @@ from synthetic_photo import blocks, sky
 
 from invrender.capture.mirror import make_ball
 from invrender.capture.table import lit_table, room_irradiance, screen_irradiance
-from invrender.capture.vignetting import (
-    find_vignetting,
-    lens_gain,
-    squared_distance,
-    without_vignetting,
-)
+from invrender.capture.vignetting import find_vignetting, without_vignetting
 from invrender.files.images import Photo
 from invrender.lights import IDEAL
-from invrender.rig import Rig
+from invrender.rig import Rig, lens_gain, squared_distance
 from invrender.sphere import directions
 
 RIG, SIZE = Rig(), (240, 320)
@@ -41,7 +36,7 @@ def table():
 
 def darkened(image, share):
     x, y = np.meshgrid(np.arange(SIZE[1]) + 0.5, np.arange(SIZE[0]) + 0.5)
-    aside = squared_distance(Photo(image), np.stack([x, y], -1))
+    aside = squared_distance(np.stack([x, y], -1), *SIZE)
     return Photo((image / lens_gain(share, aside)[..., None]).astype(np.float32))
 
 
