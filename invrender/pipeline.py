@@ -272,7 +272,8 @@ def _ask_networks(
     reconstruct, improve = networks
     asked = by_pattern([c.lights.pattern for c in crops], default_pattern())
     asked = [i for i in asked if crops[i].is_straight]
-    if len(photos) >= MEASURING_PHOTOS:
+    measured = len(photos) >= MEASURING_PHOTOS
+    if measured:
         asked = asked[:1]
     with stage("initial maps"):
         told = stage.part("initial maps")
@@ -288,7 +289,7 @@ def _ask_networks(
             if interrupted:
                 break
     priors = [network_prior(e.maps, e.sigma) for e in estimates]
-    alone = len(photos) == 1 or len(photos) >= MEASURING_PHOTOS
+    alone = len(photos) == 1 or measured
     known = lobes.maps if lobes is not None and alone else None
     return Initial(start, pooled(priors), asked[0], known, interrupted)
 

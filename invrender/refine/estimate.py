@@ -23,8 +23,8 @@ from invrender.refine.posterior import explain
 from invrender.refine.priors import Prior, lobe_prior
 from invrender.refine.several import explain_together, plain_prior
 from invrender.refine.shared import light_doubt, share
-from invrender.refine.texture import TEXTURE_SETTINGS, without_light
-from invrender.refine.theta import dielectric_share, to_maps, to_theta
+from invrender.refine.texture import without_light
+from invrender.refine.theta import dielectric_share, is_dielectric, to_maps, to_theta
 from invrender.render.near import renderer_under
 from invrender.types import Array, Mask
 
@@ -113,8 +113,8 @@ def _explain_few(
         result.factors = known.factors
         return result, known.observations
     start = initial.maps
-    plain = dielectric_share(known.prior.mean).mean() > TEXTURE_SETTINGS.least_part
-    if plain and known.misfit > CONTRADICTED:  # what pixels say is what the lights are off by
+    dielectric = is_dielectric(dielectric_share(known.prior.mean))
+    if dielectric and known.misfit > CONTRADICTED:  # pixels say what the lights are off by
         return Refined(start, initial.prior.expected, converged=True), list(photos)
     prior = without_light(known.observations, known.prior, start.roughness, samples=samples)
     kept, prior, level = keep_level(known.observations, prior, start.diffuse)
@@ -124,6 +124,5 @@ def _explain_few(
     result.factors = [
         (level * screen, level * room, level * lamps) for screen, room, lamps in known.factors
     ]
-    if any(o.away is not None for o in photos):
-        result.seen = [o.photo for o in kept]
+    result.seen = [o.photo for o in kept]
     return result, kept

@@ -67,9 +67,9 @@ class Refined:
 
     interrupted: by Ctrl-C; the maps are the best so far. factors: of each photo's screen, room and
     lamps, RGB, by which the lights were found to be off; seen: each photo without what was found of
-    its camera; both empty where they were not fitted. Of
-    several photos that were explained together: left_out, which do not belong to the others;
-    photo_errors, of each that does, the RMS of what the maps leave over its mean.
+    its camera; both empty where they were not fitted. Of several photos that were explained
+    together: left_out, which do not belong to the others; photo_errors, of each that does, the RMS
+    of what the maps leave over its mean.
     """
 
     maps: Maps

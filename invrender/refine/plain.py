@@ -20,7 +20,7 @@ import numpy as np
 from invrender.refine.gauss_newton import Observation
 from invrender.refine.priors import Prior
 from invrender.refine.shared import KNOWN, material_means
-from invrender.refine.theta import D, R, dielectric_share, project
+from invrender.refine.theta import D, R, dielectric_share, is_dielectric, project
 from invrender.sampling import resize
 from invrender.types import TINY, Array
 
@@ -30,7 +30,6 @@ class Settings:
     """Chosen by hand on 66 simulated photographs
     (docs/research-log/2026-11-30-plain-samples.md)."""
 
-    least_part: float = 0.9  # of the sample that is dielectric
     level: float = 0.03  # of the lights' strength in each colour, that is not told
     roughness: float = 1 / 3  # of its variation within a material that is kept
     side: int = 256  # pixels a side of which neighbours are compared
@@ -50,7 +49,7 @@ def keep_level(
     first: the first network's albedo (H, W, 3).
     """
     weight = dielectric_share(prior.mean)
-    if weight.mean() < s.least_part or any(o.doubt == KNOWN for o in observations):
+    if not is_dielectric(weight) or any(o.doubt == KNOWN for o in observations):
         return list(observations), prior, np.ones(3, np.float32)
     asked, before = (_mean(x, weight) + TINY for x in (prior.mean[..., D], first))
     change = np.log(asked / before)
@@ -65,7 +64,7 @@ def keep_level(
 def evened(theta: Array, s: Settings = PLAIN_SETTINGS) -> Array:
     """Maps θ (H, W, 9) without what of their variation is noise; in place."""
     weight = dielectric_share(theta)
-    if weight.mean() < s.least_part:
+    if not is_dielectric(weight):
         return theta
     uneven = theta[..., R] - material_means(theta, theta[..., R])
     mean = _mean(theta[..., D], weight)

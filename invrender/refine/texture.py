@@ -25,7 +25,7 @@ import numpy as np
 
 from invrender.refine.gauss_newton import Observation, linearise
 from invrender.refine.priors import Prior
-from invrender.refine.theta import D, N, R, dielectric_share, project
+from invrender.refine.theta import D, N, R, dielectric_share, is_dielectric, project
 from invrender.sampling import centres, resize
 from invrender.types import TINY, Array
 
@@ -39,7 +39,6 @@ class Settings:
     parts: tuple[int, ...] = (6, 7, 8, 9, 10)  # a side, whose means are compared
     margin: float = 0.04  # of the side, at the border, that is not judged
     least_fill: float = 0.3  # of a part that is dielectric
-    least_part: float = 0.9  # of the sample that is: pixels beside metal have some of its light
     least_light: float = 0.2  # of a plane's, that a pixel gets
     rounds: int = 4  # of least squares and of the weights of colours
     doubt: float = 0.02  # of what is measured of δ: lights, relief
@@ -74,7 +73,7 @@ def without_light(
     first: roughness (H, W) as it was before a correction.
     """
     weight = dielectric_share(prior.mean)
-    if weight.mean() < s.least_part:
+    if not is_dielectric(weight):
         return prior
     found = [measure_light(o, prior.mean, weight, samples, s) for o in observations]
     precisions = [1 / (m.variance + s.doubt**2) for m in found]

@@ -10,10 +10,9 @@ from invrender.types import Array
 D, S, R, N = slice(0, 3), slice(3, 6), 6, slice(7, 9)  # places of the parameters in θ
 MIN_FITTED_ROUGHNESS = 0.03
 MAX_SLOPE = 3.0  # 72 degrees
-DIELECTRIC_TO_METAL = (
-    0.08,
-    0.15,
-)  # f0 of the last sure dielectric, and of the first sure metal
+DIELECTRIC_TO_METAL = 0.08, 0.15  # f0 of the last sure dielectric, and of the first sure metal
+# Of a sample that counts as dielectric, at least: pixels beside metal have some of its light.
+DIELECTRIC_PART = 0.9
 
 
 def to_theta(maps: Maps) -> Array:
@@ -42,6 +41,11 @@ def dielectric_share(theta: Array) -> Array:
     """How surely each pixel of θ is a dielectric's, by its f0: (H, W) from 0 to 1."""
     low, high = DIELECTRIC_TO_METAL
     return np.clip((high - theta[..., S].mean(-1)) / (high - low), 0, 1)
+
+
+def is_dielectric(share: Array) -> bool:
+    """Whether a sample is, by the `dielectric_share` of its pixels."""
+    return bool(share.mean() >= DIELECTRIC_PART)
 
 
 def project(theta: Array) -> Array:

@@ -10,6 +10,7 @@ import sys
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -29,7 +30,7 @@ from invrender.refine.priors import lobe_prior, network_prior, pooled
 from invrender.refine.registration import register
 from invrender.refine.several import explain_together
 from invrender.refine.shared import share
-from invrender.refine.texture import TEXTURE_SETTINGS, without_light
+from invrender.refine.texture import without_light
 from invrender.refine.theta import N, R, deviations, to_maps, to_theta
 from invrender.render.fast.estimator import Fast
 from invrender.rig import Rig
@@ -166,8 +167,8 @@ def checked():
 
 
 def light():
-    settings = replace(TEXTURE_SETTINGS, least_part=0.3)
-    return of_prior(without_light([shot()], prior(), prior().mean[..., R] + 0.05, s=settings))
+    with patch("invrender.refine.theta.DIELECTRIC_PART", 0.3):
+        return of_prior(without_light([shot()], prior(), prior().mean[..., R] + 0.05))
 
 
 def mixed():
