@@ -102,13 +102,12 @@ def fit_screen(
         for blurred, least in SCREEN_FIT.stages[first:]:
             u = fit.solve(u, blurred * max(1.0, fit.radius / SCREEN_FIT.stage_radius), least)
         better = fit.cost(start) - fit.cost(u) > SCREEN_FIT.better
-        result = fit.result(u)
+        residual = fit.result(u).residual
         # Few pixels that nothing contradicts fit best of all, with a display like no other.
-        likely = 0 <= u[_FALLOFF] <= DISPLAY.greatest_falloff
-        likely &= result.pixels > SCREEN_FIT.least_part * ideal.pixels
+        likely = fit.is_display(u) and fit.size(u) > SCREEN_FIT.least_part * fit.size(start)
         # A screen far off has another room behind it, under which the nominal one may look worse.
-        if better and likely and result.residual < (found[0] if found else ideal.residual):
-            found = result.residual, dims, u
+        if better and likely and residual < (found[0] if found else ideal.residual):
+            found = residual, dims, u
         if found and (dims or found[0] < SCREEN_FIT.good):
             break
     if found:
@@ -390,6 +389,15 @@ class _Fit:
         more = _blur(out[:1], wider)
         return np.concatenate([blurred, (more - blurred[:1]) / step])
 
+    def size(self, u: Array) -> int:
+        """How many pixels lie wholly on the screen."""
+        return int((self.look(u)[0][..., -1] > SCREEN_FIT.inside).sum())
+
+    @staticmethod
+    def is_display(u: Array) -> bool:
+        """Whether displays dim as ``u`` says."""
+        return bool(0 <= u[_FALLOFF] <= DISPLAY.greatest_falloff)
+
     def start(self) -> Array:
         """The nominal pose, a straight curve and the gain that fits them best."""
         u = self.prior_mean.copy()
@@ -591,7 +599,7 @@ class _Fit:
             tried = self.with_block(u, block)
             gained, needed = self.cost(u) - self.cost(tried), self.least_gain(tried)
             no_curve = block == _CURVE and not Response(tuple(tried[_CURVE])).is_likely
-            if gained < needed or no_curve:
+            if gained < needed or no_curve or not self.is_display(tried):
                 self.drop(block)
                 self.free = was
                 self.prepare(u)

@@ -118,6 +118,25 @@ def test_a_display_that_dims_and_mixes_keeps_its_gain():
     np.testing.assert_allclose(found.device.gamma, DISPLAY.gamma, atol=0.03)
 
 
+@pytest.mark.parametrize("falloff", [2.0, 6.0])
+def test_no_display_is_believed_to_dim_more_than_any(falloff):
+    pattern = noise_pattern()
+    image = photograph(MOVED, *SIZE, pattern=pattern, gain=GAIN, falloff=falloff)
+    found = screen.fit_screen(Photo(image), RIG, IMAGE, pattern).device.falloff
+    assert found == pytest.approx(falloff, abs=0.1) if falloff < 3 else found <= 3
+
+
+@pytest.mark.parametrize("part", [0.3, 0.5])
+def test_a_screen_of_few_pixels_is_not_believed(part, monkeypatch):
+    """One elsewhere whose few pixels fit is none."""
+    pattern = noise_pattern()
+    image = photograph(MOVED, *SIZE, pattern=pattern, gain=GAIN)
+    size = screen._Fit.size
+    monkeypatch.setattr(screen._Fit, "size", lambda fit, u: size(fit, u) * (part if u[0] else 1))
+    found = screen.fit_screen(Photo(image), RIG, IMAGE, pattern)
+    assert (found.rig.screen_shift != RIG.screen_shift) == (part > screen.SCREEN_FIT.least_part)
+
+
 def test_a_display_that_is_told_needs_no_fit():
     pattern = noise_pattern()
     image = photograph(RIG, *SIZE, pattern=DISPLAY.shown(pattern), gain=GAIN, falloff=0.9)
