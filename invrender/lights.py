@@ -121,6 +121,7 @@ class Lights:
     screen's pose and curve were fitted, ``screen_shift`` (metres) and ``screen_tilt`` (degrees) how
     far the screen is found from its place, ``camera_tilt`` how far the camera is found to look past
     straight down, in degrees,
+    ``curve_exponent`` the standard deviation of the power of light that is left of a tone curve,
     ``ball_reflectance`` the mirror's and ``ball_reflectance_deviation`` the standard deviation of
     its logarithm (0: it was stated), with which all radiance here scales.
 

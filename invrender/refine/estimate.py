@@ -115,7 +115,7 @@ def _explain_few(
     start = initial.maps
     dielectric = is_dielectric(dielectric_share(known.prior.mean))
     if dielectric and known.misfit > CONTRADICTED:  # pixels say what the lights are off by
-        return Refined(start, initial.prior.expected, converged=True), list(photos)
+        return Refined(start, initial.prior.expected, contradicted=True), list(photos)
     prior = without_light(known.observations, known.prior, start.roughness, samples=samples)
     kept, prior, level = keep_level(known.observations, prior, start.diffuse)
     result = explain(kept, prior, samples=samples)

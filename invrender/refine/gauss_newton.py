@@ -67,7 +67,8 @@ class Refined:
 
     interrupted: by Ctrl-C; the maps are the best so far. factors: of each photo's screen, room and
     lamps, RGB, by which the lights were found to be off; seen: each photo without what was found of
-    its camera; both empty where they were not fitted. Of several photos that were explained
+    its camera; both empty where they were not fitted. contradicted: the photo and its lights do not
+    belong together, and the maps are the first ones. Of several photos that were explained
     together: left_out, which do not belong to the others; photo_errors, of each that does, the RMS
     of what the maps leave over its mean.
     """
@@ -79,6 +80,7 @@ class Refined:
     interrupted: bool = False
     factors: list[tuple[Array, Array, Array]] = field(default_factory=list)
     seen: list[Array] = field(default_factory=list)
+    contradicted: bool = False
     left_out: list[int] = field(default_factory=list)
     photo_errors: list[float] = field(default_factory=list)
 

@@ -51,6 +51,12 @@ def map_notices(
         )
     if refined.interrupted:
         note("interrupted", "interrupted: these are the best maps so far")
+    elif refined.contradicted:
+        note(
+            "lights-contradicted",
+            "the photo contradicts the light that the ball shows, as where a shadow's edge lies "
+            "elsewhere; the maps are what the networks said first: check the rig's sizes",
+        )
     elif not refined.converged:
         note("not-converged", "refinement had not converged when it reached its step limit")
     if baked > BAKED:

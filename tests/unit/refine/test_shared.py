@@ -180,17 +180,19 @@ def test_what_a_camera_does_is_found(renderer, exponent, loss):
     assert contrast(known) < 0.5 * contrast(off)
 
 
+@pytest.mark.parametrize("photos", [1, 2])
 @pytest.mark.parametrize("shadow", [1.0, 0.2])
-def test_a_shadow_that_the_lights_do_not_have_is_no_material(renderer, shadow):
+def test_a_shadow_that_the_lights_do_not_have_is_no_material(renderer, shadow, photos):
     """Where all parts together contradict the lights, a dielectric keeps its first maps."""
     maps = constant_maps(SIZE, SIZE, 0.7, 0.04, 0.6)
     photo = renderer.render(maps)
     photo[:, SIZE // 2 :] *= shadow
     first = replace(maps, roughness=maps.roughness + 0.03)
     initial = Initial(first, prior_of(first), asked=0)
-    found, _ = explain_photos([Observation(photo, renderer)], initial, 64, print, print)
+    seen = [Observation(photo, renderer), Observation(renderer.render(maps), renderer)][:photos]
+    found, _ = explain_photos(seen, initial, 64, print, print)
     moved = np.abs(found.maps.diffuse - first.diffuse).max() > 0
-    assert moved == (shadow == 1)
+    assert found.contradicted == (shadow < 1) and moved == (shadow == 1)
 
 
 def test_doubtful_lamps_are_found(renderer):

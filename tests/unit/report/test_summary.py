@@ -6,6 +6,8 @@ import pytest
 from invrender.lights import Lights
 from invrender.maps import Estimate, constant_maps
 from invrender.pattern.default import default_pattern
+from invrender.refine.gauss_newton import Refined
+from invrender.report.notices import map_notices
 from invrender.report.summary import with_mirror_error
 from invrender.rig import Rig
 
@@ -22,3 +24,19 @@ def test_an_uncertain_mirror_makes_albedos_uncertain(channels):
     assert wider.sigma["roughness"] is estimate.sigma["roughness"]
     stated = Lights(Rig(), default_pattern(8), fit={"ball_reflectance_deviation": 0.0})
     assert with_mirror_error(estimate, stated) is estimate
+
+
+@pytest.mark.parametrize(
+    ("state", "code"),
+    [
+        ({"interrupted": True, "contradicted": True}, "interrupted"),
+        ({"contradicted": True}, "lights-contradicted"),
+        ({}, "not-converged"),
+        ({"converged": True}, None),
+    ],
+)
+def test_one_sentence_tells_how_the_refinement_ended(state, code):
+    refined = Refined(constant_maps(2, 2), np.zeros((2, 2, 9)), **state)
+    clipped = np.zeros((2, 2), bool)
+    said = map_notices(Lights(Rig(), default_pattern(8)), clipped, refined, "network", 0.0, 0.0)
+    assert [notice.code for notice in said] == ([code] if code else [])
