@@ -68,7 +68,7 @@ class CaptureSet:
 
 
 PHOTOGRAPHS = CaptureSet("holdout", 90_000)
-OTHERS = CaptureSet("families", 990_000, noise=(0.002, 0.02), later=147)
+OTHERS = CaptureSet("families", 1_090_000, noise=(0.002, 0.02), later=171)
 
 
 def make_captures(

@@ -30,7 +30,7 @@ from invrender.types import Array, Mask
 
 MEASURING_PHOTOS = 3  # photos from which these count for more than what networks know
 # Of `Shared.misfit`, from which the lights on dielectrics are wrong, such as the edge of a shadow:
-# of 70 photographs it is below 0.1, of one with its screen's shadow elsewhere 2.1; of a mirror 3.5
+# of 69 photographs at most 0.1, of one with its screen's shadow elsewhere 2.1; of a mirror 3.5
 # (docs/research-log/2026-11-30-a-shadow-elsewhere.md).
 CONTRADICTED = 0.5
 
