@@ -237,6 +237,7 @@ class SheetFit:
     least_in_place: float = 0.6  # of the markers, that must be; by hand
     # Reach across an edge: modules, pixels at most.
     passes: tuple[tuple[float, float], ...] = ((0.6, 1e3), (0.6, 6.0))  # by hand
+    farthest: float = 1.5  # of the reach, that a corner may move; two edges' lines give 1.41
     edge_points: int = 12  # of an edge; by hand
     edge_samples: int = 24  # across it; by hand
     edge_inset: float = 0.12  # of an edge, left out at each end; by hand

@@ -378,7 +378,12 @@ def _refined(photo: Photo, quads: Array, reach: float, pixels: float) -> Array:
     distance = (normal * ends[..., 0, :]).sum(-1)
     matrix = np.stack([np.roll(normal, 1, 1), normal], -2)
     values = np.stack([np.roll(distance, 1, 1), distance], -1)
-    return np.asarray(np.linalg.solve(matrix, values[..., None])[..., 0])
+    found = np.linalg.solve(matrix, values[..., None])[..., 0]
+    # Across the edge of a shadow lines lie anywhere: what they say beyond their reach is not taken.
+    reached = (
+        np.linalg.norm(found - quads, axis=-1) < SHEET_FIT.farthest * half.max((1, 2, 3))[:, None]
+    )
+    return np.where(reached[..., None], found, quads)
 
 
 # --- the camera ---------------------------------------------------------------------------------

@@ -118,6 +118,20 @@ def test_a_noisy_photo_gives_the_camera(image):
     assert np.abs(at[0] - at[1]).max() < 1.0 + np.abs(grown).max()
 
 
+@pytest.mark.parametrize("turned", [0.0, 0.03, 0.3])
+@pytest.mark.parametrize("at", [0.25, 0.4, 0.55, 0.7])
+def test_a_shadows_edge_over_markers_moves_no_corner(image, at, turned):
+    """It crosses columns of markers, along their edges or aslant."""
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
+    edge = (x - at * SIZE[1] + turned * (y - SIZE[0] / 2)) / 4
+    shade = 0.15 + 0.85 * np.clip(edge + 0.5, 0, 1)
+    plain, shaded = (use_sheet(captured(im))[1] for im in (image, image * shade[..., None]))
+    both = np.intersect1d(plain.ids, shaded.ids)
+    assert len(both) >= 0.6 * len(plain.ids)
+    a, b = (f.corners[[list(f.ids).index(k) for k in both]] for f in (plain, shaded))
+    assert np.abs(a - b).max() < 2 and abs(plain.fov - shaded.fov) < 0.5
+
+
 def test_a_strong_tilt_tells_the_field_of_view():
     true = Rig(camera_tilt=(0, 22, 0), camera_shift=(0.05, 0, 0.02), fov=60)
     image = sheet_photo(true, *SIZE, noise=0.005)
