@@ -104,7 +104,7 @@ def linearise(
     rho, p, q = (Float(aligned(x, Float)) for x in flat[6:])
     view = make_view(renderer.scene, height or h, w, seed, top * w, h * w)
     material = Material(diffuse, specular, rho, vec3(p, q, Float(1)))
-    j = renderer.pixel_jacobian(view, material, samples)
+    j = renderer.jacobian_again(view, material, samples)
     slope_p = j.tangent_s * j.s.x + j.tangent_t * j.t.x
     slope_q = j.tangent_s * j.s.y + j.tangent_t * j.t.y
     dr.eval(j.radiance, j.diffuse, j.specular, j.roughness, slope_p, slope_q)

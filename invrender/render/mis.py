@@ -109,6 +109,10 @@ class Mis(Renderer):
         super().__init__(scene)
         self.sampler = sampler or EnvironmentSampler.build(scene)
 
+    @property
+    def traced(self) -> tuple[Any, ...]:
+        return self.scene, self.sampler
+
     def _shade(
         self, view: View, roughness: Any, normal: Any, samples: int, jacobian: bool
     ) -> Shading:

@@ -39,6 +39,10 @@ class WithNearLamp(Renderer):
         super().__init__(room.scene)
         self.room, self.lamp, self.near = room, lamp, near
 
+    @property
+    def traced(self) -> tuple[Any, ...]:
+        return *self.room.traced, *self.lamp.traced
+
     def scaled(self, screen: Any, room: Any, added: Any = None) -> Self:
         own = self.near.share[..., None]
         rest, more = (None, None) if added is None else (added * (1 - own), added * own)

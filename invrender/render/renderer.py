@@ -11,6 +11,7 @@ carries along; lights and pose are differentiated by Dr.Jit through the same cod
 
 from __future__ import annotations
 
+import weakref
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from typing import Any, Self
@@ -55,6 +56,7 @@ class Renderer(ABC):
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
+        self._recorded: dict[tuple[int, int], Any] = {}
 
     @classmethod
     def under(cls, lights: Lights) -> Self:
@@ -78,6 +80,11 @@ class Renderer(ABC):
         if environment is not None and added is not None:
             environment = dr.maximum(environment + scalar(aligned(added.ravel(), scalar)), 0)
         return type(self)(replace(scene, gain=scene.gain * vec3(*by), environment=environment))
+
+    @property
+    @abstractmethod
+    def traced(self) -> tuple[Any, ...]:
+        """Dataclasses that hold all Dr.Jit arrays of which pixels are shaded."""
 
     @abstractmethod
     def _shade(
@@ -132,6 +139,20 @@ class Renderer(ABC):
             # One kernel, the same whatever is done with its results.
             dr.eval(list(j.__dict__.values()))
             return j
+
+    def jacobian_again(self, view: View, material: Material, samples: int) -> PixelJacobian:
+        """`pixel_jacobian` for many calls: from the second one for as many pixels it is not traced
+        any more, which takes longer than the kernels of some thousands of pixels."""
+        key = dr.width(view.x), samples
+        if key not in self._recorded:
+            me = weakref.ref(self)  # else it would live until garbage is collected
+            self._recorded[key] = dr.freeze(
+                lambda view, material: me().pixel_jacobian(view, material, samples),
+                state_fn=lambda *_: me().traced,
+            )
+            return self.pixel_jacobian(view, material, samples)
+        jacobian: PixelJacobian = self._recorded[key](view, material)
+        return jacobian
 
     def render(self, maps: Maps, samples: int = 64, seed: int = 0) -> NDArray[np.float32]:
         """Linear RGB image (H, W, 3) of maps, in tiles of bounded memory."""

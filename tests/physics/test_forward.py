@@ -279,7 +279,8 @@ def test_detail_lowers_the_error_of_the_tables():
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_nothing_is_recompiled(estimator):
-    """New seeds, sample counts, maps, gains, lights and rigs reuse the first call's kernels."""
+    """New seeds, sample counts, maps, gains, lights and rigs reuse the first call's kernels; and a
+    Jacobian that is asked for again is the same, with other maps and seeds too."""
     rng = np.random.default_rng(0)
 
     def call(k):
@@ -293,7 +294,17 @@ def test_nothing_is_recompiled(estimator):
         renderer = ESTIMATORS[estimator](scene)
         material = Material.from_maps(maps)
         dr.eval(renderer.radiance(view, material, 8 + k))
-        renderer.pixel_jacobian(view, material, 9 + k)
+        for again in range(3):
+            view = make_view(scene, 16, 16, seed=k + again)
+            material = Material.from_maps(some_maps(16, "glossy", seed=k + again))
+            traced, recorded = (
+                np.array([*j.radiance, *j.roughness, *j.tangent_s, *j.s])
+                for j in (
+                    renderer.pixel_jacobian(view, material, 9 + k),
+                    renderer.jacobian_again(view, material, 9 + k),
+                )
+            )
+            np.testing.assert_array_equal(traced, recorded)
 
     call(0)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):

@@ -84,6 +84,17 @@ def test_its_jacobian_is_that_of_differences(maps):
         assert error(near, k) < 1.5 * error(far, k) + 0.005, k
 
 
+def test_its_jacobian_is_the_same_again(maps):
+    """Of other maps, from a renderer that was asked before."""
+    lights = lights_with(PLACE)
+    asked, theta = renderer_under(lights), to_theta(maps)
+    for k in range(3):
+        theta[..., 6:] *= 0.9
+        for a, b in zip(*(linearise(r, theta, 256) for r in (asked, renderer_under(lights))),
+                        strict=True):  # fmt: skip
+            np.testing.assert_array_equal(a, b, err_msg=str(k))
+
+
 def test_from_afar_it_is_the_environments(maps):
     far = tuple(1e4 * np.asarray(PLACE))
     room = lights_with(PLACE, near=False)

@@ -36,6 +36,10 @@ class Fast(Renderer):
         super().__init__(scene)
         self.tables = fast_tables(scene, detail)
 
+    @property
+    def traced(self) -> tuple[Any, ...]:
+        return (self.tables,)
+
     def _shade(
         self, view: View, roughness: Any, normal: Any, samples: int, jacobian: bool
     ) -> Shading:

@@ -22,6 +22,7 @@ from invrender.rig import Rig
 from invrender.sphere import scale_environment
 
 SIZE = 24
+SAMPLES = 16  # of the lobe, in photos as in what explains them
 NAMES = ("diffuse", "specular", "roughness", "normal")
 
 
@@ -47,7 +48,7 @@ def truth():
 
 def photos_of(maps, renderers):
     rng = np.random.default_rng(0)
-    photos = [r.render(maps, 64) for r in renderers]
+    photos = [r.render(maps, SAMPLES) for r in renderers]
     photos = [p * (1 + 0.005 * rng.standard_normal(p.shape).astype(np.float32)) for p in photos]
     return [Observation(p, r) for p, r in zip(photos, renderers, strict=True)]
 
@@ -62,7 +63,7 @@ def as_a_network_errs(truth):
 
 
 def explained(photos, prior):
-    return explain_together(photos, prior)
+    return explain_together(photos, prior, samples=SAMPLES)
 
 
 @pytest.fixture(scope="module")
@@ -200,7 +201,7 @@ def lamps():
 def test_lamps_alone_measure_dielectrics_and_metals(lamps, kind):
     truth = procedural_material(5, SIZE, SIZE, kind=kind)
     photos = photos_of(truth, lamps)
-    prior = plain_prior(photos, 64)
+    prior = plain_prior(photos, SAMPLES)
     found_metal = prior.mean[..., 3:6].mean(-1) > 0.2
     metal = truth.specular.mean(-1) > 0.3
     assert np.mean(found_metal == metal) > 0.8
