@@ -145,10 +145,10 @@ class Renderer(ABC):
         any more, which takes longer than the kernels of some thousands of pixels."""
         key = dr.width(view.x), samples
         if key not in self._recorded:
-            me = weakref.ref(self)  # else it would live until garbage is collected
+            me: Renderer = weakref.proxy(self)  # else it would live until garbage is collected
             self._recorded[key] = dr.freeze(
-                lambda view, material: me().pixel_jacobian(view, material, samples),
-                state_fn=lambda *_: me().traced,
+                lambda view, material: me.pixel_jacobian(view, material, samples),
+                state_fn=lambda *_: me.traced,
             )
             return self.pixel_jacobian(view, material, samples)
         jacobian: PixelJacobian = self._recorded[key](view, material)
