@@ -24,6 +24,7 @@ from invrender.pattern.default import default_pattern
 from invrender.report.report import Report
 from invrender.report.result import Result
 from invrender.report.summary import summarise
+from invrender.sampling import resize
 from invrender.types import Array
 
 if TYPE_CHECKING:  # Dr.Jit compiles where the refinement is imported
@@ -197,6 +198,7 @@ def estimate_maps(
     with stage("read"):
         networks = networks or load_networks(init)
     with stage("forward model"):  # Dr.Jit compiles here; nothing before needs it.
+        from invrender.refine.enlarge import WHOLE
         from invrender.refine.estimate import (
             MEASURING_PHOTOS,
             explain_photos,
@@ -206,6 +208,8 @@ def estimate_maps(
         )
         from invrender.refine.flat import plain_image
 
+    if networks and len(crops) < MEASURING_PHOTOS and max(crops[0].photo.shape) > WHOLE:
+        return _estimate_large(crops, stage, samples, networks)
     own, free = crops, len(crops) > 1 and any(c.place is None for c in crops)
     if free:
         with stage("registration"):
@@ -253,6 +257,29 @@ def _without(
     kept = [i for i in range(len(own)) if i not in odd]
     start, refined, photos = estimate_maps([own[i] for i in kept], stage, init, samples, networks)
     refined.left_out = sorted([*odd, *(kept[i] for i in refined.left_out)])
+    return start, refined, photos
+
+
+def _estimate_large(
+    crops: Sequence[Sample], stage: Stages, samples: int, networks: Networks
+) -> tuple[Maps, Refined, list[Observation]]:
+    """`estimate_maps` of few large photos: all is judged by the photos shrunk, to which the initial
+    maps belong, and the refined maps follow the details of the first photo that is not left out."""
+    from invrender.refine.enlarge import LARGE_SAMPLES, WHOLE, enlarge, explain_details, fitting
+
+    small = [c.shrunk(*fitting(c.photo, WHOLE)) for c in crops]
+    start, refined, photos = estimate_maps(small, stage, samples=samples, networks=networks)
+    k = next(i for i in range(len(crops)) if i not in refined.left_out)
+    photo, clipped, whole = crops[k].photo, crops[k].clipped, refined.maps
+    with stage("enlarge"):
+        if 0 in refined.cameras and photos[0].away is not None:
+            away = resize(photos[0].away, *photo.shape[:2])
+            photo = refined.cameras[0].undone(photo, away)
+        refined.seen = [photo]
+        refined.maps = enlarge(whole, photo)
+        renderer = photos[0].renderer
+        refined.rendering = renderer.render(refined.maps, LARGE_SAMPLES)
+        explain_details(refined.maps, refined.rendering, photo, clipped, whole, renderer)
     return start, refined, photos
 
 

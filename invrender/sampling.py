@@ -18,12 +18,12 @@ def resize(image: Array, height: int, width: int) -> Array:
     for axis, size in enumerate((height, width)):
         if result.shape[axis] != size:
             moved = np.ascontiguousarray(np.swapaxes(result, 0, axis))
-            new = _weights(moved.shape[0], size) @ moved.reshape(moved.shape[0], -1)
+            new = resize_weights(moved.shape[0], size) @ moved.reshape(moved.shape[0], -1)
             result = np.swapaxes(new.reshape(size, *moved.shape[1:]), 0, axis)
     return np.ascontiguousarray(result)
 
 
-def _weights(old: int, new: int) -> csr_array:
+def resize_weights(old: int, new: int) -> csr_array:
     """Weights (new, old) of old pixels in new ones. Sparse: no BLAS threads to fight others'."""
     edges = np.linspace(0, old, new + 1)
     if new <= old:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from invrender.lights import Lights
 from invrender.maps import Maps, resize_maps
+from invrender.refine.enlarge import WHOLE, fitting
 from invrender.refine.gauss_newton import linearise
 from invrender.refine.lobes import FIT_SIZE, fit_lobes, lobe_terms, read_lobes
 from invrender.refine.theta import to_theta
@@ -25,7 +26,7 @@ from nets.batch import Batch, batch_of, lobe_input, positions
 from nets.blocks import without_grid
 from nets.clues import light_inputs, white_level
 from nets.model import LEAST_LEVEL, MAPS, MAX_PHOTO
-from nets.scales import COARSE, WHOLE, Prediction, enlarged, fitting, shaded, shrunk
+from nets.scales import COARSE, Prediction, enlarged, shaded, shrunk
 from nets.store import load_weights
 
 WEIGHTS = Path(__file__).with_name("weights")

@@ -7,20 +7,16 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from invrender.maps import Estimate, Maps, resize_maps, unit_normals
+from invrender.refine.enlarge import enlarge, fitting
 from invrender.refine.lobes import Lobes
 from invrender.sampling import resize
-from invrender.types import TINY, Array
+from invrender.types import Array
 from nets.model import LEAST_MAP_ROUGHNESS
 
-WHOLE = 256  # pixels of the longer side at which a sample is judged as a whole
 COARSE = 128  # pixels of the longer side at which the correction was trained
-# Of the guided filter, by hand: pixels a side of its window; deviation of the photo's logarithm
-# that tells nothing; what is added to the photo before, of its mean; n·z of the steepest normal.
-GUIDE_SIZE, GUIDE_NOISE, DARK, STEEPEST_SLOPE = 5, 0.03, 0.02, 0.1
 
 
 @dataclass(frozen=True)
@@ -39,13 +35,6 @@ class Prediction(Estimate):
     coarse: Prediction | None = None
     whole: Prediction | None = None
     interrupted: bool = False
-
-
-def fitting(photo: Array, longest: int) -> tuple[int, int]:
-    """Height and width of the photo (H, W, 3) shrunk until the longer of them is ``longest``."""
-    height, width = photo.shape[:2]
-    scale = longest / max(height, width)
-    return max(1, round(height * scale)), max(1, round(width * scale))
 
 
 def shrunk(
@@ -79,51 +68,7 @@ def shaded(
 
 
 def enlarged(whole: Prediction, photo: Array) -> Prediction:
-    """The estimate of a photo (H, W, 3) from that of the photo shrunk.
-
-    A guided filter (He, Sun, Tang 2013): slopes and albedos are linear in the logarithm of the
-    photo around each small pixel, and what is linear there goes on to the details. Roughness, and
-    expected errors, are interpolated: with the photo they do not vary.
-    """
-    height, width = photo.shape[:2]
-    low = whole.maps.shape
-    dark = DARK * photo.mean((0, 1)) + TINY
-    guide = np.log(np.maximum(photo, 0) + dark).astype(np.float32)
-    small = resize(guide, *low)
-    guide -= resize(small, height, width)  # now what the small one does not show
-    mean = _around(small)
-    spread = _around(small[..., :, None] * small[..., None, :])
-    spread -= mean[..., :, None] * mean[..., None, :]
-    inverse = np.linalg.inv(spread + np.float32(GUIDE_NOISE**2) * np.eye(3, dtype=np.float32))
-
-    def detailed(image: Array) -> Array:
-        out = resize(image, height, width)
-        for k in range(image.shape[-1]):
-            x = image[..., k : k + 1]
-            covariance = _around(small * x) - mean * _around(x)
-            slope = np.einsum("hwij,hwj->hwi", inverse, covariance)
-            out[..., k] += np.einsum("hwi,hwi->hw", resize(_around(slope), height, width), guide)
-        return out
-
-    maps = whole.maps
-    normal = np.ones((height, width, 3), np.float32)
-    normal[..., :2] = detailed(
-        maps.normal[..., :2] / np.maximum(maps.normal[..., 2:], STEEPEST_SLOPE)
-    )
-    maps = Maps(
-        np.clip(detailed(maps.diffuse), 0, 1),
-        np.clip(detailed(maps.specular), 0, 1),
-        resize(maps.roughness, height, width),
-        unit_normals(normal),
-    )
-    sigma = resized(whole.sigma, height, width)
-    return replace(whole, maps=maps, sigma=sigma, coarse=None, whole=whole)
-
-
-def _around(image: Array) -> Array:
-    """Means over the square around each pixel of (H, W, ...)."""
-    from kornia.filters import box_blur
-
-    planes = torch.from_numpy(image.reshape(*image.shape[:2], -1)).permute(2, 0, 1)[None]
-    blurred = box_blur(planes, GUIDE_SIZE, border_type="replicate", separable=True)
-    return blurred[0].permute(1, 2, 0).numpy().reshape(image.shape)
+    """The estimate of a photo (H, W, 3) from that of the photo shrunk. Expected errors are
+    interpolated: with the photo they do not vary."""
+    sigma = resized(whole.sigma, *photo.shape[:2])
+    return replace(whole, maps=enlarge(whole.maps, photo), sigma=sigma, coarse=None, whole=whole)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from invrender.capture.lights import FoundLights
 from invrender.capture.placement import find_place
 from invrender.files.images import Photo
 from invrender.lights import Lights
+from invrender.sampling import resize
 from invrender.types import Array, InputError, Mask
 
 STRAIGHT = 10.0  # degrees up to which networks read a turned sample
@@ -44,6 +45,11 @@ class Sample:
         """Whether the sample lies as in the first photo, by and large."""
         place = np.eye(3) if self.place is None else self.place
         return bool(abs(np.degrees(np.arctan2(place[1, 0], place[0, 0]))) < STRAIGHT)
+
+    def shrunk(self, height: int, width: int) -> Sample:
+        """With means over so many pixels; what touches a saturated one is saturated."""
+        clipped = resize(self.clipped.astype(np.float32), height, width) > 0
+        return replace(self, photo=resize(self.photo, height, width), clipped=clipped)
 
     def placed(self, place: Array) -> Sample:
         """The square of the sample that lies where a homography takes this one's own, with the

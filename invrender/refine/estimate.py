@@ -124,5 +124,5 @@ def _explain_few(
     result.factors = [
         (level * screen, level * room, level * lamps) for screen, room, lamps in known.factors
     ]
-    result.seen = [o.photo for o in kept]
+    result.seen, result.cameras = [o.photo for o in kept], known.cameras
     return result, kept

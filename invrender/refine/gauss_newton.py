@@ -61,16 +61,34 @@ class Observation:
     away: Array | None = None
 
 
+@dataclass(frozen=True)
+class Camera:
+    """What is left of a camera in a photo: ``loss`` times what is `Observation.away` was taken of
+    the light's logarithm, and the light raised to a power 1 + ``exponent`` about ``middle``."""
+
+    exponent: float
+    loss: float
+    middle: float
+
+    def undone(self, photo: Array, away: Array) -> Array:
+        """A photo (H, W, 3) as it was before its camera did that."""
+        light = np.maximum(photo, 0) * np.exp(self.loss * away[..., None])
+        return np.asarray(
+            self.middle * (light / self.middle) ** (1 / (1 + self.exponent)), np.float32
+        )
+
+
 @dataclass
 class Refined:
     """Maps, their posterior standard deviations (H, W, 9) in the order of θ, how the fit went.
 
     interrupted: by Ctrl-C; the maps are the best so far. factors: of each photo's screen, room and
     lamps, RGB, by which the lights were found to be off; seen: each photo without what was found of
-    its camera; both empty where they were not fitted. contradicted: the photo and its lights do not
-    belong together, and the maps are the first ones. Of several photos that were explained
-    together: left_out, which do not belong to the others; photo_errors, of each that does, the RMS
-    of what the maps leave over its mean.
+    its camera, and cameras what that is; empty where they were not fitted. contradicted: the photo
+    and its lights do not belong together, and the maps are the first ones. rendering: of the maps,
+    where it was made already. Of several photos that were explained together: left_out, which do
+    not belong to the others; photo_errors, of each that does, the RMS of what the maps leave over
+    its mean.
     """
 
     maps: Maps
@@ -80,7 +98,9 @@ class Refined:
     interrupted: bool = False
     factors: list[tuple[Array, Array, Array]] = field(default_factory=list)
     seen: list[Array] = field(default_factory=list)
+    cameras: dict[int, Camera] = field(default_factory=dict)
     contradicted: bool = False
+    rendering: Array | None = None
     left_out: list[int] = field(default_factory=list)
     photo_errors: list[float] = field(default_factory=list)
 

@@ -34,7 +34,7 @@ from typing import Any
 import numpy as np
 
 from invrender.refine.flat import USUAL_SPECULAR
-from invrender.refine.gauss_newton import BAND, Observation, linearise
+from invrender.refine.gauss_newton import BAND, Camera, Observation, linearise
 from invrender.refine.groups import group
 from invrender.refine.priors import Prior, channel_correlation
 from invrender.refine.theta import D, N, R, S, dielectric_share, project
@@ -103,12 +103,13 @@ Factors = tuple[Array, Array, Array]  # of screen, room and lamps, RGB
 class Shared:
     """prior: with the maps as their materials are found to be. observations: with the lights as
     they are found, the photos without what is found of their cameras. factors: of each photo's
-    screen, room and lamps, RGB. converged: the steps ended by themselves. misfit: mean square of
-    the parts' residuals over what is expected."""
+    screen, room and lamps, RGB. cameras: by photo, where they are not known. converged: the steps
+    ended by themselves. misfit: mean square of the parts' residuals over what is expected."""
 
     prior: Prior
     observations: list[Observation]
     factors: list[Factors] = field(default_factory=list)
+    cameras: dict[int, Camera] = field(default_factory=dict)
     converged: bool = True
     misfit: float = 0.0
     interrupted: bool = False
@@ -144,10 +145,16 @@ def share(
         o if o.doubt == KNOWN else replace(o, renderer=_scaled(o, *f))
         for o, f in zip(observations, factors, strict=True)
     ]
-    for i, camera in problem.camera.items():
-        shots[i] = replace(shots[i], photo=_without_camera(shots[i], *solved.u[camera]))
+    cameras = {}
+    for i, found in problem.camera.items():
+        away = shots[i].away
+        assert away is not None
+        exponent, loss = map(float, solved.u[found])
+        level = float(np.median(_raised(shots[i].photo, away, loss)))
+        cameras[i] = Camera(exponent, loss, max(level, TINY))
+        shots[i] = replace(shots[i], photo=cameras[i].undone(shots[i].photo, away))
     return Shared(
-        replace(prior, mean=theta, total=total), shots, factors,
+        replace(prior, mean=theta, total=total), shots, factors, cameras,
         solved.converged, solved.misfit, solved.interrupted,
     )  # fmt: skip
 
@@ -161,12 +168,9 @@ def _with_camera(image: Array, away: Array, exponent: float, loss: float) -> tup
     return photo, photo[..., None] * np.stack([log, -lost], -1)
 
 
-def _without_camera(o: Observation, exponent: float, loss: float) -> Array:
-    """An observation's photo as it was before its camera did that."""
-    assert o.away is not None
-    photo = np.maximum(o.photo, 0) * np.exp(loss * o.away[..., None])
-    middle = max(float(np.median(photo)), TINY)
-    return np.asarray(middle * (photo / middle) ** (1 / (1 + exponent)), np.float32)
+def _raised(photo: Array, away: Array, loss: float) -> Array:
+    """A photo with the light that its lens took."""
+    return np.asarray(np.maximum(photo, 0) * np.exp(np.float32(loss) * away[..., None]))
 
 
 def _scaled(o: Observation, screen: Any, room: Any, lamps: Any) -> Renderer:

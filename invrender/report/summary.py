@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ from invrender.maps import Estimate, Maps, map_errors, resize_maps
 from invrender.report.notices import map_notices
 from invrender.report.report import Report
 from invrender.report.result import SAMPLES, Result
+from invrender.sampling import resize
 from invrender.types import Array, Notice
 
 if TYPE_CHECKING:  # Dr.Jit compiles where the refinement is imported
@@ -37,8 +39,9 @@ def summarise(
     """The result of all captures that were found, in the frame and under the lights of the first
     one that was not left out.
 
-    crops: the sample in each; ``renderer`` is that first one's. start: the initial maps. samples:
-    of the specular lobe, where only the error matters. The report's seconds are left to the caller.
+    crops: the sample in each; ``renderer`` is that first one's. start: the initial maps, which may
+    be smaller than the refined ones: all errors are those at their size. samples: of the specular
+    lobe, where only the error matters. The report's seconds are left to the caller.
     """
     from invrender.refine.checks import baked_light, coarse_error, photo_error
     from invrender.refine.theta import deviations
@@ -46,12 +49,17 @@ def summarise(
     k = next(i for i in range(len(found)) if i not in refined.left_out)
     first, lights, capture = crops[k], found[k].lights, found[k].capture
     photo, size = refined.seen[0] if refined.seen else first.photo, len(first.photo)
-    # The second is kept; of the first, and of many pixels, only the error matters.
-    counts = ((start, samples), (refined.maps, SAMPLES if size <= FINE else samples))
-    pictures = [renderer.render(maps, count) for maps, count in counts]
-    before, after = (photo_error(p, photo, first.clipped) for p in pictures)
-    baked = baked_light(refined.maps.diffuse, renderer, samples)
-    coarse = coarse_error(pictures[1], photo, first.clipped)
+    rendering = refined.rendering
+    if rendering is None:  # of many pixels only the error matters
+        rendering = renderer.render(refined.maps, SAMPLES if size <= FINE else samples)
+    judged, maps = replace(first, photo=photo).shrunk(*start.shape), refined.maps
+    maps, seen = resize_maps(maps, *start.shape), resize(rendering, *start.shape)
+    before, after = (
+        photo_error(p, judged.photo, judged.clipped)
+        for p in (renderer.render(start, samples), seen)
+    )
+    baked = baked_light(maps.diffuse, renderer, samples)
+    coarse = coarse_error(seen, judged.photo, judged.clipped)
     notices = map_notices(lights, first.clipped, refined, init, baked, coarse)
     names = [f.capture.name for f in found]
     left_out = [names[i] for i in refined.left_out]
@@ -66,8 +74,8 @@ def summarise(
     used = [name for name in names if name not in left_out]
     errors = None
     if capture.truth is not None:
-        truth = resize_maps(capture.truth, size, size)
-        errors = {"initial": map_errors(start, truth), "refined": map_errors(refined.maps, truth)}
+        truth = resize_maps(capture.truth, *start.shape)
+        errors = {"initial": map_errors(start, truth), "refined": map_errors(maps, truth)}
     report = Report(
         status="interrupted" if refined.interrupted else "done",
         capture=" + ".join(names),
@@ -85,9 +93,10 @@ def summarise(
         photos=dict(zip(used, refined.photo_errors, strict=False)),
         versions={n: version(n) for n in PACKAGES},
     )
-    estimate = with_mirror_error(Estimate(refined.maps, deviations(refined.sigma)), lights)
-    seen = lights.scaled(*refined.factors[0]) if refined.factors else lights
-    return Result(estimate, seen, photo, report, pictures[1])
+    sigma = with_mirror_error(Estimate(maps, deviations(refined.sigma)), lights).sigma
+    sigma = {k: resize(v, *photo.shape[:2]) for k, v in sigma.items()}
+    found_lights = lights.scaled(*refined.factors[0]) if refined.factors else lights
+    return Result(Estimate(refined.maps, sigma), found_lights, photo, report, rendering)
 
 
 def with_mirror_error(estimate: Estimate, lights: Lights) -> Estimate:
