@@ -17,7 +17,8 @@ def crop_sample(photo: Photo, rig: Rig, size: int = 256) -> Array:
     """The sample's square of the photo as (size, size, 3) radiance, row 0 at +y.
 
     Each pixel is the mean over its square of the sample when the photo is finer than the crop, and
-    interpolated by cubic splines where it is coarser. Raises `InputError` if the sample is not
+    interpolated by cubic splines where it is coarser. A photo pixel or two at the sample's border
+    are not taken, the next inside are. Raises `InputError` if the sample is not
     whole in the photo.
     """
     sample_corners(photo, rig)
@@ -41,6 +42,10 @@ def crop_part(photo: Photo, rig: Rig, size: int, place: Array | None = None) -> 
     wide = 2 * round((scale / samples - 1) / 2) + 1  # odd, so that nothing moves
     order = 3 if scale < CROP.spline_scale else 1  # the mean over many pixels needs no splines
     points = _placed(rig.sample_points(size * samples, size * samples), rig, place)
+    # Next to the border the lens mixes in what lies around the sample, often white paper.
+    edge = CROP.edge * max(1.0, w / CROP.edge_width) / (scale * size)
+    inner = rig.sample_size * (0.5 - min(edge, 0.5))
+    points[..., :2] = np.clip(points[..., :2], -inner, inner)
     pixels = rig.project(points, h, w)
     at = np.stack([pixels[..., 1] - y0 - 0.5, pixels[..., 0] - x0 - 0.5])
     planes = []

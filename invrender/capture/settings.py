@@ -589,6 +589,10 @@ class Crop:
     margin: int = 8  # pixels around the sample's square; by hand
     mask_margin: int = 10  # the same, of the saturated pixels; by hand
     spline_scale: float = 2.0  # photo pixels in a pixel, below which splines are used; by hand
+    # Pixels at the sample's border that show its surroundings too, of a photo so wide (pixels) or
+    # narrower: benchmarks/device.py's lenses blur by up to 0.8.
+    edge: float = 2.0
+    edge_width: float = 1280.0
     touched: float = 0.05  # share of saturated pixels in one that counts as saturated; by hand
     tolerance: float = 0.5  # pixels that the sample may reach beyond the photo; by hand
     beyond: float = 1.01  # halves of the side, of what another photo shows; by hand

@@ -387,6 +387,19 @@ def test_crop_shows_the_sample(size, tilt):
     assert np.sqrt(np.mean((crop - truth) ** 2)) < (0.012 if size == 32 else 0.004)
 
 
+@pytest.mark.parametrize(("size", "scale"), [(64, 1), (128, 1), (256, 1), (128, 2)])
+def test_white_paper_around_the_sample_stays_out_of_the_crop(size, scale):
+    """Through a lens that blurs by 0.6 pixels of a photo 960 wide, whatever the photo's size."""
+    half = RIG.sample_size / 2
+    inside = lambda p: np.abs(p[..., :2]).max(-1, keepdims=True) < half  # noqa: E731
+    image = photograph(
+        RIG, *np.multiply(SIZE, scale), table=lambda p: np.where(inside(p), 0.1, 0.8) + [0.0] * 3,
+        ball=None,
+    )  # fmt: skip
+    image = ndimage.gaussian_filter(image, (0.6 * scale, 0.6 * scale, 0))
+    assert np.abs(crop_sample(Photo(image), RIG, size) - 0.1).max() < 0.012
+
+
 @pytest.mark.parametrize("tilt", [(6.0, 0.0, 0.0), (0.0, -5.0, 0.0), (4.0, 4.0, 5.0)])
 def test_a_tilted_camera_gives_the_same_crop(tilt, folder):
     """A homography, where ``rig.toml`` tells the tilt: 5 to 8 degrees, and a turn in the plane."""
