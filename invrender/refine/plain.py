@@ -3,11 +3,13 @@
 - **Level.** Where the photo asks for an albedo a few per cent off the first network's, the lights'
   strength, told by a ball, is as likely to be off by that: they take it.
 - **Variation.** Roughness varies little within a material; of what networks see of it most is noise
-  of the photo, or its light. Nor is there a texture where neighbouring pixels hardly vary together:
-  then the albedo's variation is noise too, and is left out.
+  of the photo, or its light. Details that go with the albedo's are the texture's own and stay.
+  There is no texture where neighbouring pixels hardly vary together: then the albedo's variation is
+  noise too, and none is kept.
 
-Both are shrunk by what is expected of such errors, c, as a change or a deviation x: by 1 - (c/x)²
-or the square of that, and wholly below c (Breiman's garrote, 1995). What is well above stays.
+The level and the albedo's variation are shrunk by what is expected of such errors, c, as a change
+or a deviation x: by 1 - (c/x)² or the square of that, and wholly below c (Breiman's garrote, 1995).
+What is well above stays.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
 from invrender.refine.gauss_newton import Observation
 from invrender.refine.priors import Prior
@@ -27,11 +30,13 @@ from invrender.types import TINY, Array
 
 @dataclass(frozen=True)
 class Settings:
-    """Chosen by hand on 66 simulated photographs
-    (docs/research-log/2026-11-30-plain-samples.md)."""
+    """Chosen by hand on 66 simulated photographs (docs/research-log/2026-11-30-plain-samples.md),
+    what is kept of roughness on 113 (docs/research-log/2026-11-30-roughness-kept-and-found.md)."""
 
     level: float = 0.03  # of the lights' strength in each colour, that is not told
-    roughness: float = 1 / 3  # of its variation within a material that is kept
+    fine: float = 1 / 16  # of the side: the Gaussian beyond which a detail of roughness is shade
+    dark: float = 0.01  # added to the albedo, whose logarithm such details are compared with
+    roughness: float = 0.2  # of the other details that is kept
     side: int = 256  # pixels a side of which neighbours are compared
     contrast: tuple[float, float] = (0.03, 0.003)  # they share on plain samples: of k_d; at least
     alone: float = 0.4  # of a pixel's own deviation, that counts too: a weave's neighbours differ
@@ -76,9 +81,20 @@ def evened(theta: Array, s: Settings = PLAIN_SETTINGS) -> Array:
     of, least = s.contrast
     plain = (of * mean.mean()) ** 2 + least**2
     noise = min(1.0, plain / float(shared)) ** 2
+    details = _details(uneven, s)
+    texture = _details(np.log(theta[..., D].mean(-1) + s.dark), s)
+    follows = np.average(details * texture, weights=weight)
+    follows /= np.average(texture**2, weights=weight) + TINY
+    kept = s.roughness * details + (1 - s.roughness) * follows * texture
+    theta[..., R] -= weight * (uneven - (1 - noise) * kept)
     theta[..., D] -= noise * weight[..., None] * (theta[..., D] - np.float32(mean))
-    theta[..., R] -= (1 - s.roughness) * weight * uneven
     return project(theta)
+
+
+def _details(image: Array, s: Settings) -> Array:
+    """An image (H, W) without its wide shades."""
+    wide = gaussian_filter(image, [s.fine * n for n in image.shape])
+    return np.asarray(image - wide)
 
 
 def _mean(image: Array, weight: Array) -> Array:

@@ -13,7 +13,8 @@ mirrored and turned, in which no δ stands, is the error of δ, and so is what p
 find.
 
 Either the maps are right, or the first network was, whose roughness a correction has changed, or
-neither: three priors of δ, and the photo chooses.
+neither: three priors of δ, and the photo chooses. That a lobe is narrower than the maps' shows more
+surely than that it is wider, which half of the photos that say so are wrong about.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ from invrender.types import TINY, Array
 @dataclass(frozen=True)
 class Settings:
     """Chosen by hand on 66 simulated photographs
-    (docs/research-log/2026-11-30-starts-and-the-light-in-the-albedo.md)."""
+    (docs/research-log/2026-11-30-starts-and-the-light-in-the-albedo.md), what is above nought on 117
+    (docs/research-log/2026-11-30-roughness-kept-and-found.md)."""
 
     side: int = 128  # pixels a side that are judged
     parts: tuple[int, ...] = (6, 7, 8, 9, 10)  # a side, whose means are compared
@@ -44,6 +46,7 @@ class Settings:
     doubt: float = 0.02  # of what is measured of δ: lights, relief
     starts: tuple[float, ...] = (1, 1, 2)  # odds of these maps, of the first network's, of neither
     near: float = 0.015  # deviation of δ where a start is right
+    wider: float = 3.0  # times its error that a δ above nought is off by
     shared_error: float = 0.5  # of a network's squared error that a material shares
 
 
@@ -76,7 +79,10 @@ def without_light(
     if not is_dielectric(weight):
         return prior
     found = [measure_light(o, prior.mean, weight, samples, s) for o in observations]
-    precisions = [1 / (m.variance + s.doubt**2) for m in found]
+    times = [1 if m.delta < 0 else s.wider for m in found]
+    precisions = [
+        1 / (t**2 * m.variance + s.doubt**2) for t, m in zip(times, found, strict=True)
+    ]
     measured = sum(m.delta * p for m, p in zip(found, precisions, strict=True)) / sum(precisions)
     usual, back = (
         float(np.average(x, weights=weight))

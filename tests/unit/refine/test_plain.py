@@ -111,12 +111,33 @@ def test_a_weave_of_single_pixels_stays():
     assert evened(theta)[..., D].std() > 0.9 * before
 
 
-def test_roughness_keeps_a_third_of_its_variation():
-    theta = noisy(0.3, 8)
+def kept_of(variation, deviation, of=1):
+    """Share of an image (H, W) of roughness that stays on a sample whose albedo is `noisy`."""
+    theta = noisy(deviation, of)
+    theta[..., R] = flat().roughness + variation(theta[..., D].mean(-1))
     uneven = theta[..., R] - theta[..., R].mean()
     after = evened(theta)[..., R]
-    slope = float((after * uneven).sum() / (uneven**2).sum())
-    assert slope == pytest.approx(PLAIN_SETTINGS.roughness, abs=0.03)
+    return float((after * uneven).sum() / (uneven**2).sum())
+
+
+def test_roughness_that_goes_with_the_albedo_stays():
+    def alike(albedo):
+        return 0.05 * np.log(albedo + 0.01)
+
+    assert kept_of(alike, 0.3) > 0.9
+    assert kept_of(lambda albedo: -alike(albedo), 0.3) > 0.9
+
+
+def test_other_details_of_roughness_go_but_a_fifth_and_wide_shades_wholly():
+    noise = 0.02 * np.random.default_rng(3).standard_normal((SIZE, SIZE))
+    found = kept_of(lambda _: noise, 0.3)
+    assert found == pytest.approx(PLAIN_SETTINGS.roughness, abs=0.05)
+    shade = 0.02 * np.sin(np.linspace(0, np.pi, SIZE))[:, None] * np.ones(SIZE)
+    assert abs(kept_of(lambda _: shade, 0.3)) < 0.05
+
+
+def test_a_plain_sample_has_one_roughness():
+    assert abs(kept_of(lambda albedo: 2 * (albedo - albedo.mean()), 0.01)) < 0.02
 
 
 def test_metal_keeps_all_of_it():

@@ -8,9 +8,16 @@ import pytest
 from invrender.data.environments import procedural_environment
 from invrender.maps import constant_maps
 from invrender.pattern.default import default_pattern
+from invrender.refine import texture
 from invrender.refine.gauss_newton import Observation, linearise
 from invrender.refine.priors import network_prior
-from invrender.refine.texture import TEXTURE_SETTINGS, _chosen, measure_light, without_light
+from invrender.refine.texture import (
+    TEXTURE_SETTINGS,
+    Measured,
+    _chosen,
+    measure_light,
+    without_light,
+)
 from invrender.refine.theta import D, R, S, to_maps, to_theta
 from invrender.render.fast.estimator import Fast
 from invrender.render.scene import make_scene
@@ -160,6 +167,17 @@ def test_parts_of_two_sizes_tell_their_scatter(renderer):
     scatter = (few.delta - many.delta) ** 2 / 4
     assert both.variance == pytest.approx((few.variance + many.variance) / 2 + scatter)
     assert scatter > 0.1 * few.variance
+
+
+def test_a_wider_lobe_is_believed_less(monkeypatch):
+    """Of δ measured with the same error."""
+    prior = network_prior(sample(0.2, 0.6), {k: np.full((SIZE,) * 2, v) for k, v in SIGMA.items()})
+    moved = []
+    for delta in (0.06, -0.06):
+        found = Measured(delta, 0.02**2, np.zeros((SIZE, SIZE, 3), np.float32))
+        monkeypatch.setattr(texture, "measure_light", lambda *_, found=found: found)
+        moved.append(abs(float((found_in([None], prior).mean - prior.mean)[..., R].mean())))
+    assert 0.2 * moved[1] < moved[0] < 0.8 * moved[1]
 
 
 def test_the_posterior_of_three_starts():
