@@ -34,7 +34,7 @@ from invrender.types import TINY, Array
 @dataclass(frozen=True)
 class Settings:
     """Chosen by hand on 66 simulated photographs
-    (docs/research-log/2026-11-30-starts-and-the-light-in-the-albedo.md), what is above nought on 117
+    (docs/research-log/2026-11-30-starts-and-the-light-in-the-albedo.md), `wider` on 117
     (docs/research-log/2026-11-30-roughness-kept-and-found.md)."""
 
     side: int = 128  # pixels a side that are judged
@@ -80,9 +80,7 @@ def without_light(
         return prior
     found = [measure_light(o, prior.mean, weight, samples, s) for o in observations]
     times = [1 if m.delta < 0 else s.wider for m in found]
-    precisions = [
-        1 / (t**2 * m.variance + s.doubt**2) for t, m in zip(times, found, strict=True)
-    ]
+    precisions = [1 / (t**2 * m.variance + s.doubt**2) for t, m in zip(times, found, strict=True)]
     measured = sum(m.delta * p for m, p in zip(found, precisions, strict=True)) / sum(precisions)
     usual, back = (
         float(np.average(x, weights=weight))
