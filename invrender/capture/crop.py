@@ -41,21 +41,40 @@ def crop_part(photo: Photo, rig: Rig, size: int, place: Array | None = None) -> 
     samples = min(max(1, math.ceil(scale)), CROP.samples)
     wide = 2 * round((scale / samples - 1) / 2) + 1  # odd, so that nothing moves
     order = 3 if scale < CROP.spline_scale else 1  # the mean over many pixels needs no splines
-    points = _placed(rig.sample_points(size * samples, size * samples), rig, place)
+    planes = [np.asarray(crop[..., c], np.float32) for c in range(3)]
+    if wide > 1:
+        planes = [ndimage.uniform_filter(plane, wide, mode="nearest") for plane in planes]
+    around = 0
+    if order > 1:  # as `map_coordinates` does it, but once for all bands
+        around = CROP.spline_margin
+        planes = [
+            ndimage.spline_filter(np.pad(p, around, mode="edge"), order, mode="nearest")
+            for p in planes
+        ]
     # Next to the border the lens mixes in what lies around the sample, often white paper.
     edge = CROP.edge * max(1.0, w / CROP.edge_width) / (scale * size)
     inner = rig.sample_size * (0.5 - min(edge, 0.5))
-    points[..., :2] = np.clip(points[..., :2], -inner, inner)
-    pixels = rig.project(points, h, w)
-    at = np.stack([pixels[..., 1] - y0 - 0.5, pixels[..., 0] - x0 - 0.5])
-    planes = []
-    for c in range(3):
-        plane = crop[..., c]
-        if wide > 1:
-            plane = ndimage.uniform_filter(plane, wide, mode="nearest")
-        plane = ndimage.map_coordinates(plane, at, order=order, mode="nearest")
-        planes.append(plane.reshape(size, samples, size, samples).mean((1, 3)))
-    return np.maximum(np.stack(planes, -1), 0).astype(np.float32)
+    out = np.empty((size, size, 3), np.float32)
+    rows = max(1, CROP.band // (size * samples**2))
+    for top in range(0, size, rows):
+        band = slice(top, min(top + rows, size))
+        points = _placed(_sample_rows(rig, size * samples, band, samples), rig, place)
+        points[..., :2] = np.clip(points[..., :2], -inner, inner)
+        pixels = rig.project(points, h, w)
+        at = np.stack([pixels[..., 1] - y0 - 0.5, pixels[..., 0] - x0 - 0.5]) + around
+        for c, plane in enumerate(planes):
+            fine = ndimage.map_coordinates(plane, at, order=order, mode="nearest", prefilter=False)
+            mean = fine.reshape(-1, samples, size, samples).mean((1, 3))
+            out[band, :, c] = np.maximum(mean, 0)
+    return out
+
+
+def _sample_rows(rig: Rig, size: int, band: slice, samples: int) -> Array:
+    """The rows of `Rig.sample_points` (size, size) that lie in a band of rows ``samples`` as
+    high."""
+    x, y = rig.sample_points(1, size)[0, :, 0], rig.sample_points(size, 1)[:, 0, 1]
+    y = y[band.start * samples : band.stop * samples]
+    return np.stack([*np.meshgrid(x, y), np.zeros((len(y), size))], -1)
 
 
 def _placed(points: Array, rig: Rig, place: Array | None) -> Array:

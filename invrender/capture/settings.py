@@ -593,6 +593,8 @@ class Crop:
     # narrower: benchmarks/device.py's lenses blur by up to 0.8.
     edge: float = 2.0
     edge_width: float = 1280.0
+    spline_margin: int = 12  # pixels, which `scipy.ndimage.map_coordinates` adds; its own number
+    band: int = 1 << 19  # samples that are taken at once
     touched: float = 0.05  # share of saturated pixels in one that counts as saturated; by hand
     tolerance: float = 0.5  # pixels that the sample may reach beyond the photo; by hand
     beyond: float = 1.01  # halves of the side, of what another photo shows; by hand

@@ -2,14 +2,16 @@
 pixels a side, where networks and priors are made, and details follow the photo.
 
 A guided filter (He, Sun, Tang 2013): slopes and albedos are linear in the logarithm of the photo
-around each small pixel, and what is linear there goes on to the details. Roughness is interpolated:
-with the photo it does not vary. Maps and photo are sharpened before they are interpolated, so that
-what is shrunk again is what it was. It is done in bands of rows, in bounded memory.
+around each small pixel, and what is linear there goes on to the details, without the photo's noise.
+Roughness is interpolated: with the photo it does not vary. Maps and photo are sharpened before they
+are interpolated, so that what is shrunk again is what it was. All is done in bands of rows, in
+bounded memory.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 
 import numpy as np
 from scipy.ndimage import uniform_filter
@@ -32,7 +34,11 @@ GUIDE_SIZE, GUIDE_NOISE, DARK, STEEPEST_SLOPE = 5, 0.03, 0.02, 0.1
 TAKEN, LITTLE_LIGHT = 0.5, 0.2
 LIGHT_SAMPLES = 64  # of the specular lobe
 LARGE_SAMPLES = 16  # of the specular lobe, in the rendering of maps that are large: noise of 1%
-STRIP = 1 << 16  # pixels at once
+# Pixels a side up to which a photo's noise is white: beyond, it is interpolated. By hand.
+WHITE_UP_TO = 1024
+LEAST = 1e-100  # a variance that is none, in any unit
+SEEN = 4  # of so many bands one tells the finest octave's covariance
+BAND_PIXELS = 1 << 16  # pixels at once
 
 
 def fitting(photo: Array, longest: int) -> tuple[int, int]:
@@ -50,19 +56,19 @@ def enlarge(maps: Maps, photo: Array) -> Maps:
     def log(band: slice) -> Array:
         return np.log(np.maximum(photo[band], 0) + dark).astype(np.float32, copy=False)
 
-    guide = _shrunk(log, height, width, maps.shape)
+    guide, details = _guide(log, height, width, maps.shape)
     slopes = maps.normal[..., :2] / np.maximum(maps.normal[..., 2:], STEEPEST_SLOPE)
     detailed = np.concatenate([maps.diffuse, maps.specular, slopes], -1)
-    sharp = _sharpened(np.concatenate([guide, detailed], -1), height, width)
+    sharp = _sharpened(detailed, height, width)
     parts = [sharp, maps.roughness[..., None], _following(guide, detailed)]
     interpolated = _interpolation(np.concatenate(parts, -1), height, width)
     out = constant_maps(height, width)
     for band in _bands(height, width):
         full = interpolated(band)
-        found, out.roughness[band] = full[:, 3:11], full[:, 11]
-        detail = np.swapaxes(log(band), 1, 2) - full[:, :3]
+        found, out.roughness[band] = full[:, :8], full[:, 8]
+        detail = details(band)
         for k in range(found.shape[1]):
-            found[:, k] += (full[:, 12 + 3 * k : 15 + 3 * k] * detail).sum(1)
+            found[:, k] += (full[:, 9 + 3 * k : 12 + 3 * k] * detail).sum(1)
         albedos = np.clip(found[:, :6], 0, 1)
         # What a surface mirrors it cannot scatter too.
         diffuse = np.minimum(albedos[:, :3], 1 - albedos[:, 3:])
@@ -89,20 +95,84 @@ def explain_details(
     def lacks(band: slice) -> Array:
         return np.where(clipped[band][..., None], 0, photo[band] - picture[band])
 
-    coarse = _shrunk(lacks, height, width, small.shape)
+    _, details = _guide(lacks, height, width, small.shape)
     share = TAKEN * dielectric_share(theta)[..., None] / (light**2 + level**2)
-    interpolated = _interpolation(np.concatenate([coarse, light * share, light], -1), height, width)
+    interpolated = _interpolation(np.concatenate([light * share, light], -1), height, width)
     for band in _bands(height, width):
-        full = np.swapaxes(interpolated(band), 1, 2)
-        change = full[..., 3:6] * (lacks(band) - full[..., :3])
+        full = interpolated(band)
+        change = np.swapaxes(full[:, :3] * details(band), 1, 2)
         change[clipped[band]] = 0
         diffuse = np.clip(maps.diffuse[band] + change, 0, 1 - maps.specular[band])
-        picture[band] += (diffuse - maps.diffuse[band]) * full[..., 6:]
+        picture[band] += (diffuse - maps.diffuse[band]) * np.swapaxes(full[:, 3:], 1, 2)
         maps.diffuse[band] = diffuse
 
 
+def _guide(
+    image: Callable[[slice], Array], height: int, width: int, low: tuple[int, int]
+) -> tuple[Array, Callable[[slice], Array]]:
+    """Means (h, w, 3) of an image (H, W, 3) told in bands of rows, and what tells its details
+    beyond them, (rows, 3, W), without their noise.
+
+    Octave by octave, of twice the pixels a side: colours' covariance C of a texture is alike in two
+    of them but for a factor, while noise is white and of each colour by itself. That tells its
+    variances N, and the details are (C - N)·C⁻¹ of what is seen (Wiener).
+    """
+    sizes = [low]
+    while 2 * max(sizes[-1]) < max(height, width):
+        sizes.append((2 * sizes[-1][0], 2 * sizes[-1][1]))
+    levels = [_shrunk(image, height, width, sizes[-1])]
+    for size in [*sizes[-2::-1], tuple(-(-n // 2) for n in low)]:
+        levels.insert(0, resize(levels[0], *size))
+    octaves = [b - _enlarged(a, *b.shape[:2]) for a, b in pairwise(levels)]
+    last = _interpolation(_sharpened(levels[-1], height, width), height, width)
+    finest = lambda band: np.swapaxes(image(band), 1, 2) - last(band)  # noqa: E731
+    some = [np.swapaxes(finest(b), 1, 2) for b in [*_bands(height, width)][::SEEN]]
+    seen = [_covariance(o) for o in [*octaves, np.concatenate(some)]]
+    sides = [float(max(x.shape[:2])) ** 2 for x in levels] + [float(max(height, width)) ** 2]
+    gains = _gains(seen, sides)
+    clean = np.zeros_like(levels[1])
+    for octave, gain in zip(octaves[1:], gains[1:-1], strict=True):
+        clean = _enlarged(clean, *octave.shape[:2]) + octave @ gain
+    coarse = _interpolation(_sharpened(clean, height, width), height, width)
+
+    def details(band: slice) -> Array:
+        return np.einsum("rcw,cd->rdw", finest(band), gains[-1]) + coarse(band)
+
+    return levels[1], details
+
+
+def _enlarged(image: Array, height: int, width: int) -> Array:
+    """Interpolated to so many pixels; shrunk again it is as it was."""
+    return resize(_sharpened(image, height, width), height, width)
+
+
+def _covariance(colours: Array) -> Array:
+    flat = colours.reshape(-1, 3)
+    return np.asarray(flat.T @ flat / len(flat), np.float64)
+
+
+def _gains(seen: list[Array], sides: list[float]) -> list[Array]:
+    """What octaves with these covariances have of their textures, (3, 3) each. sides: squares of
+    the pixels a side between which they lie, one more."""
+    areas = np.diff(sides)
+    j = max(i for i in range(1, len(seen)) if i == 1 or sides[i] < WHITE_UP_TO**2)
+    apart = ~np.eye(3, dtype=bool)
+    fine, coarse = seen[j], seen[j - 1]
+    falls = max(float((fine * coarse)[apart].sum() / (np.sum(coarse[apart] ** 2) + LEAST)), 0.0)
+    left = np.diag(fine - falls * coarse) / max(areas[j] - falls * areas[j - 1], 1.0)
+    noise = np.diag(np.maximum(left, 0))
+    gains = []
+    for covariance, area in zip(seen, areas, strict=True):
+        values, axes = np.linalg.eigh(covariance - area * noise)
+        texture = (axes * np.maximum(values, 0)) @ axes.T
+        both = texture + area * noise
+        inverse = np.linalg.inv(both + max(TINY * np.trace(both), LEAST) * np.eye(3))
+        gains.append((inverse @ texture).astype(np.float32))
+    return gains
+
+
 def _bands(height: int, width: int) -> Iterator[slice]:
-    rows = max(1, STRIP // width)
+    rows = max(1, BAND_PIXELS // width)
     for top in range(0, height, rows):
         yield slice(top, min(top + rows, height))
 

@@ -55,8 +55,9 @@ def report_html(
     """The page. sigma: of each encoded map, see `invrender.maps.Estimate`. environment:
     (H, 2H, 3) radiance; pattern: (h, w, 3) the screen's radiance as captured, None
     without one; photo, picture: (N, N, 3) radiance of the sample and of its re-rendering."""
-    white = max(float(np.percentile(photo, 99.5)), 1e-12)
-    encoded = maps.encoded()
+    white = white_level(photo)
+    photo, picture = (block_means(x, PICTURE_SIZE) for x in (photo, picture))
+    encoded = Maps(**{k: block_means(v, PICTURE_SIZE) for k, v in vars(maps).items()}).encoded()
     pictures = [
         (_jpeg(linear_to_srgb(photo / white)), "Photo", "the sample, cropped"),
         (_jpeg(linear_to_srgb(picture / white)), "Re-rendering", "from the maps below"),
@@ -69,7 +70,7 @@ def report_html(
     shown = []
     for name, (title, text) in TITLES.items():
         image = encoded[name] if name in ("roughness", "normal") else linear_to_srgb(encoded[name])
-        spread = sigma[name]
+        spread = block_means(sigma[name], PICTURE_SIZE)
         spread = np.sqrt(np.mean(spread**2, -1)) if spread.ndim == 3 else spread
         shown.append({
             "name": name, "title": title, "text": text, "uri": _jpeg(image),
@@ -118,12 +119,12 @@ def viewer_data(maps: Maps, environment: Array) -> dict[str, Any]:
     Albedos are 8-bit sRGB; slopes and roughness have 16 bits, in two images of bytes, since eight
     would show as facets in a polished metal.
     """
-    encoded = maps.encoded()
     diffuse, specular, normal, roughness = (
-        block_means(encoded[k], VIEWER_SIZE) for k in ("diffuse", "specular", "normal", "roughness")
+        block_means(x, VIEWER_SIZE)
+        for x in (maps.diffuse, maps.specular, maps.normal, maps.roughness)
     )
     size = max(diffuse.shape[:2])
-    slopes = normal[..., :2] * 2 - 1
+    slopes = normal[..., :2]
     words = np.concatenate([slopes * 32767 + 32768, roughness[..., None] * 65535], -1)
     words = np.clip(np.rint(words), 0, 65535).astype(np.uint16)
     textures = {
@@ -223,6 +224,11 @@ def _convergence(report: Report) -> Markup:
         "photo error against seconds of refinement</text></svg>"
     )
     return Markup("".join(parts))  # numbers and our own words only
+
+
+def white_level(photo: Array) -> float:
+    """The radiance of a sample's photo that is drawn white."""
+    return max(float(np.percentile(block_means(photo, PICTURE_SIZE), 99.5)), 1e-12)
 
 
 def _level(radiance: Array) -> float:

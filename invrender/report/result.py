@@ -5,14 +5,15 @@ from __future__ import annotations
 import json
 import os
 import tempfile
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from invrender.colour import srgb_to_linear
 from invrender.files.images import read_image
 from invrender.files.maps import read_maps, write_maps
 from invrender.files.rig_toml import read_rig, write_rig
@@ -101,7 +102,7 @@ class Result:
             raise InputError(f"{out} cannot be written: {error.strerror or error}") from None
 
     def _write(self, folder: Path) -> None:
-        from invrender.report.page import report_html
+        from invrender.report.page import report_html, white_level
 
         maps, sigma, lights, photo = self.maps, self.estimate.sigma, self.lights, self.photo
         rendering = self.render() if self.rendering is None else self.rendering
@@ -111,37 +112,47 @@ class Result:
         elif screen is None:
             screen = lights.shown * np.asarray(lights.gain, np.float32)
         width = lights.rig.sample_size
-        beside = ThreadPoolExecutor(1)
-        page = beside.submit(
-            report_html, self.report, maps, sigma, lights.environment, screen, photo, rendering
-        )
-        beside.shutdown(wait=False)
-        write_maps(folder, maps, width=width)
-        for key, image in sigma.items():
-            write_exr(folder / f"sigma_{key}.exr", image, data=True, width=width)
-        for key, image in maps.encoded().items():
-            write_png(folder / f"{key}.png", image, linear=key in ("normal", "roughness"))
+        white = white_level(photo)
+        # Grey where they agree; a tenth of white away from black or white.
+        difference = np.clip(0.5 + (rendering - photo) * np.float32(5 / white), 0, 1)
+
+        def page() -> None:
+            shown = (lights.environment, screen, photo, rendering)
+            html = report_html(self.report, maps, sigma, *shown)
+            (folder / "report.html").write_text(html, encoding="utf-8")
+
+        def exr(name: str, image: Array, **how: Any) -> Callable[[], object]:
+            return partial(write_exr, folder / f"{name}.exr", image, **how)
+
+        def png(name: str, image: Array, **how: Any) -> Callable[[], object]:
+            return partial(write_png, folder / f"{name}.png", image, **how)
+
+        calls: list[Callable[[], object]] = [
+            page,
+            partial(write_maps, folder, maps, width=width),
+            *(exr(f"sigma_{k}", image, data=True, width=width) for k, image in sigma.items()),
+            *(png(k, image, linear=k in ("normal", "roughness"))
+              for k, image in maps.encoded().items()),
+            exr("sample", photo, width=width),
+            png("photo", photo, white=white),
+            png("render", rendering, white=white),
+            png("difference", difference, coded=True),
+            exr("environment", lights.environment),
+        ]  # fmt: skip
+        if screen is not None:
+            calls += [exr("pattern_shown", lights.shown), exr("pattern_captured", screen)]
+        if lights.coverage is not None:
+            calls.append(exr("coverage", lights.coverage))
+        with ThreadPoolExecutor(2) as both:  # encoding leaves the interpreter's lock
+            for call in [both.submit(c) for c in calls]:
+                call.result()
         # The pattern is saved as it is shown: only the dimming to the sides is left to tell.
         falloff = Device(falloff=lights.device.falloff)
         write_rig(folder / "rig.toml", lights.rig, device=falloff)
-        write_exr(folder / "environment.exr", lights.environment)
-        if screen is not None:
-            write_exr(folder / "pattern_shown.exr", lights.shown)
-            write_exr(folder / "pattern_captured.exr", screen)
-        if lights.coverage is not None:
-            write_exr(folder / "coverage.exr", lights.coverage)
         if lights.near is not None:
             write_exr(folder / LAMP_FILES[0], lights.near.share, data=True)
             where = {k: list(getattr(lights.near, k)) for k in ("place", "seen_from")}
             (folder / LAMP_FILES[1]).write_text(json.dumps(where) + "\n", encoding="utf-8")
-        write_exr(folder / "sample.exr", photo, width=width)
-        white = max(float(np.percentile(photo, 99.5)), 1e-12)
-        write_png(folder / "photo.png", photo / white)
-        write_png(folder / "render.png", rendering / white)
-        # Grey where they agree; a tenth of white away from black or white.
-        difference = srgb_to_linear(0.5 + 5 * (rendering - photo) / white)
-        write_png(folder / "difference.png", difference)
-        (folder / "report.html").write_text(page.result(), encoding="utf-8")
         (folder / "report.json").write_text(
             json.dumps(self.report.to_dict(), indent=2) + "\n", encoding="utf-8"
         )

@@ -56,7 +56,7 @@ def test_bands_leave_no_seams(textured, monkeypatch):
     photo, maps = textured
     small = resize_maps(maps, SMALL, SMALL)
     whole = enlarge(small, photo)
-    monkeypatch.setattr(module, "STRIP", 7 * SIZE)
+    monkeypatch.setattr(module, "BAND_PIXELS", 7 * SIZE)
     for name, image in vars(enlarge(small, photo)).items():
         np.testing.assert_allclose(image, getattr(whole, name), atol=1e-5, err_msg=name)
 
@@ -89,6 +89,15 @@ def test_noise_makes_no_details(textured):
     even = np.full_like(noise, 0.3, dtype=np.float32)
     found, plain = enlarge(maps, even * np.float32(1 + noise)), enlarge(maps, even)
     assert np.abs(found.diffuse - plain.diffuse).mean() < 0.005
+
+
+def test_a_photos_noise_stays_out_of_its_texture(textured):
+    """White noise of each colour by itself is told from a texture, of which little is lost."""
+    photo, maps = textured
+    small = resize_maps(maps, SMALL, SMALL)
+    noise = 0.1 * np.random.default_rng(1).standard_normal(photo.shape).astype(np.float32)
+    error = lambda photo: np.abs(enlarge(small, photo).diffuse - maps.diffuse).mean()  # noqa: E731
+    assert error(photo * (1 + noise)) < 1.5 * error(photo)
 
 
 @pytest.mark.parametrize("level", [0.0, 1e-12, 1e12])
