@@ -36,6 +36,9 @@ LIGHT_SAMPLES = 64  # of the specular lobe
 LARGE_SAMPLES = 16  # of the specular lobe, in the rendering of maps that are large: noise of 1%
 # Pixels a side up to which a photo's noise is white: beyond, it is interpolated. By hand.
 WHITE_UP_TO = 1024
+BELOW = 2  # octaves below the details that are looked at too
+WHOLE_OCTAVE = 3.5  # areas, of the one below, of an octave that tells noise
+MOST_RISE = 1.0  # of a texture's variance from an octave to the next: noise has four; by hand
 LEAST = 1e-100  # a variance that is none, in any unit
 SEEN = 4  # of so many bands one tells the finest octave's covariance
 BAND_PIXELS = 1 << 16  # pixels at once
@@ -121,7 +124,8 @@ def _guide(
     while 2 * max(sizes[-1]) < max(height, width):
         sizes.append((2 * sizes[-1][0], 2 * sizes[-1][1]))
     levels = [_shrunk(image, height, width, sizes[-1])]
-    for size in [*sizes[-2::-1], tuple(-(-n // 2) for n in low)]:
+    below = [tuple(max(n >> k, 1) for n in low) for k in range(1, BELOW + 1)]
+    for size in [*sizes[-2::-1], *below]:
         levels.insert(0, resize(levels[0], *size))
     octaves = [b - _enlarged(a, *b.shape[:2]) for a, b in pairwise(levels)]
     last = _interpolation(_sharpened(levels[-1], height, width), height, width)
@@ -130,15 +134,15 @@ def _guide(
     seen = [_covariance(o) for o in [*octaves, np.concatenate(some)]]
     sides = [float(max(x.shape[:2])) ** 2 for x in levels] + [float(max(height, width)) ** 2]
     gains = _gains(seen, sides)
-    clean = np.zeros_like(levels[1])
-    for octave, gain in zip(octaves[1:], gains[1:-1], strict=True):
+    clean = np.zeros_like(levels[BELOW])
+    for octave, gain in zip(octaves[BELOW:], gains[BELOW:-1], strict=True):
         clean = _enlarged(clean, *octave.shape[:2]) + octave @ gain
     coarse = _interpolation(_sharpened(clean, height, width), height, width)
 
     def details(band: slice) -> Array:
         return np.einsum("rcw,cd->rdw", finest(band), gains[-1]) + coarse(band)
 
-    return levels[1], details
+    return levels[BELOW], details
 
 
 def _enlarged(image: Array, height: int, width: int) -> Array:
@@ -155,11 +159,13 @@ def _gains(seen: list[Array], sides: list[float]) -> list[Array]:
     """What octaves with these covariances have of their textures, (3, 3) each. sides: squares of
     the pixels a side between which they lie, one more."""
     areas = np.diff(sides)
-    j = max(i for i in range(1, len(seen)) if i == 1 or sides[i] < WHITE_UP_TO**2)
+    whole = [i for i in range(1, len(seen)) if areas[i] > WHOLE_OCTAVE * areas[i - 1]]
+    j = max(i for i in [1, *whole] if i == 1 or sides[i] < WHITE_UP_TO**2)
     apart = ~np.eye(3, dtype=bool)
     fine, coarse = seen[j], seen[j - 1]
-    falls = max(float((fine * coarse)[apart].sum() / (np.sum(coarse[apart] ** 2) + LEAST)), 0.0)
-    left = np.diag(fine - falls * coarse) / max(areas[j] - falls * areas[j - 1], 1.0)
+    alike = float((fine * coarse)[apart].sum() / (np.sum(coarse[apart] ** 2) + LEAST))
+    rises = min(max(alike, 0.0), MOST_RISE)
+    left = np.diag(fine - rises * coarse) / (areas[j] - rises * areas[j - 1])
     noise = np.diag(np.maximum(left, 0))
     gains = []
     for covariance, area in zip(seen, areas, strict=True):
