@@ -55,7 +55,10 @@ def observe(photo: Array, lights: Lights, clipped: Mask) -> Observation:
     mask = clipped if clipped.any() else None
     doubt, exponent = light_doubt(lights.fit), lights.fit.get("curve_exponent", 0.0)
     away = lights.rig.lens_distance(*photo.shape[:2]).astype(np.float32) if lights.fit else None
-    return Observation(photo, renderer_under(lights), mask, doubt, lights.lamps, exponent, away)
+    return Observation(
+        photo, renderer_under(lights), mask, doubt, lights.lamps, exponent, away,
+        lights.fit.get("gain_deviation", 0.0),
+    )  # fmt: skip
 
 
 def flat_start(photos: Sequence[Observation], samples: int) -> Initial:

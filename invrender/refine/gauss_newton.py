@@ -49,7 +49,8 @@ class Observation:
     are known. lamps: as in `invrender.lights.Lights`, the light that the room's doubt is not about.
     exponent: deviation of the power of light that the photo's values may still be, of a JPEG's tone
     curve. away (H, W): squared distances from the photo's middle, of a corner's, for what a lens
-    takes of the light; None where that is known.
+    takes of the light; None where that is known. level: deviation of the logarithm of the screen's
+    radiance by its image in the ball, by which all albedos may be off.
     """
 
     photo: Array
@@ -59,6 +60,7 @@ class Observation:
     lamps: Array | None = None
     exponent: float = 0.0
     away: Array | None = None
+    level: float = 0.0
 
 
 @dataclass(frozen=True)

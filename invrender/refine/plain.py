@@ -1,7 +1,8 @@
 """What a plain dielectric's maps keep of what the photo asks for: little that is noise or light.
 
-- **Level.** Where the photo asks for an albedo a few per cent off the first network's, the lights'
-  strength, told by a ball, is as likely to be off by that: they take it.
+- **Level.** Where the photo asks for an albedo off the first network's by no more than what the
+  lights' strength, told by a ball, is known to, they take it: one per cent, ten in a JPEG whose
+  screen is saturated.
 - **Variation.** Roughness varies little within a material; of what networks see of it most is noise
   of the photo, or its light. Details that go with the albedo's are the texture's own and stay.
   There is no texture where neighbouring pixels hardly vary together: then the albedo's variation is
@@ -31,9 +32,11 @@ from invrender.types import TINY, Array
 @dataclass(frozen=True)
 class Settings:
     """Chosen by hand on 66 simulated photographs (docs/research-log/2026-11-30-plain-samples.md),
-    what is kept of roughness on 113 (docs/research-log/2026-11-30-roughness-kept-and-found.md)."""
+    what is kept of roughness on 113 (docs/research-log/2026-11-30-roughness-kept-and-found.md),
+    levels on these (docs/research-log/2026-11-30-levels-of-jpegs.md)."""
 
-    level: float = 0.03  # of the lights' strength in each colour, that is not told
+    level: float = 0.01  # of the lights' strength in each colour, that is not told, at least
+    of_gain: float = 0.6  # and of what the screen's is known to (`Observation.level`)
     fine: float = 1 / 16  # of the side: the Gaussian beyond which a detail of roughness is shade
     dark: float = 0.01  # added to the albedo, whose logarithm such details are compared with
     roughness: float = 0.2  # of the other details that is kept
@@ -58,7 +61,8 @@ def keep_level(
         return list(observations), prior, np.ones(3, np.float32)
     asked, before = (_mean(x, weight) + TINY for x in (prior.mean[..., D], first))
     change = np.log(asked / before)
-    left = np.exp(change * np.minimum(1, (s.level / (np.abs(change) + TINY)) ** 2))
+    doubt = np.hypot(s.level, s.of_gain * min(o.level for o in observations))
+    left = np.exp(change * np.minimum(1, (doubt / (np.abs(change) + TINY)) ** 2))
     left = left.astype(np.float32)
     mean = prior.mean.copy()
     mean[..., D] *= 1 + weight[..., None] * (1 / left - 1)

@@ -32,6 +32,9 @@ def flat(k_d=ALBEDO, k_s=0.04):
     return constant_maps(SIZE, SIZE, k_d, k_s, 0.6)
 
 
+LEVEL = 0.05  # of the photos' lights
+
+
 def asked(renderer, factor, doubt=(0.01, 0.05), k_s=0.04):
     """A photo that asks for ``factor`` times the first network's albedo; its prior."""
     maps = flat(ALBEDO * np.float32(factor), k_s)
@@ -39,7 +42,8 @@ def asked(renderer, factor, doubt=(0.01, 0.05), k_s=0.04):
     sigma = {
         k: np.full(shape, 0.05, np.float32) for k in ("normal", "diffuse", "roughness", "specular")
     }
-    return Observation(renderer.render(maps, 64), renderer, None, doubt), network_prior(maps, sigma)
+    photo = Observation(renderer.render(maps, 64), renderer, None, doubt, level=LEVEL)
+    return photo, network_prior(maps, sigma)
 
 
 def test_a_level_within_the_lights_doubt_is_the_lights(renderer):
@@ -57,9 +61,17 @@ def test_a_level_well_above_it_is_the_samples(renderer):
     photo, prior = asked(renderer, 1.3)
     _, found, left = keep_level([photo], prior, flat().diffuse)
     taken = np.log(found.mean[..., D].mean((0, 1)) / ALBEDO)
-    doubt = PLAIN_SETTINGS.level
+    doubt = np.hypot(PLAIN_SETTINGS.level, PLAIN_SETTINGS.of_gain * LEVEL)
     np.testing.assert_allclose(taken, np.log(1.3) - doubt**2 / np.log(1.3), rtol=1e-3)
     np.testing.assert_allclose(np.log(left) + taken, np.log(1.3), rtol=1e-3)
+
+
+def test_lights_that_are_known_well_take_less(renderer):
+    photo, prior = asked(renderer, 1.04)
+    known = replace(photo, level=0.0)
+    for photos, least, most in (([photo], 0.6, 0.9), ([known], 0, 0.1), ([photo, known], 0, 0.1)):
+        left = keep_level(photos, prior, flat().diffuse)[2]
+        assert least < np.log(left).mean() / np.log(1.04) < most
 
 
 @pytest.mark.parametrize(("doubt", "k_s"), [((0.0, 0.0), 0.04), ((0.01, 0.05), 0.6)])
