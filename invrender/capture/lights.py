@@ -13,6 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from invrender.capture.ball import agrees, find_fov, measure_reflectance
 from invrender.capture.ball_image import BallImage, trace_image, unfold_pattern
+from invrender.capture.ball_shade import without_ball_shade
 from invrender.capture.camera import find_camera
 from invrender.capture.clipped_lamps import raise_clipped
 from invrender.capture.environment import fill_environment, unfold_environment
@@ -118,7 +119,8 @@ def find_lights(
         unseen = sheet is None and found.camera_tilt is not None
         lights.fit["border_unseen"] = float(unseen)
         lights.fit["curve_exponent"] = photo.curve_deviation / -math.log(DISPLAY.sample)
-        capture = replace(capture, photo=photo.in_rec709())
+        photo = without_ball_shade(photo.in_rec709(), lights, found)
+        capture = replace(capture, photo=photo)
     if environment is not None:
         lights = replace(lights, environment=environment)
     if gain is not None:

@@ -600,6 +600,27 @@ class Crop:
     beyond: float = 1.01  # halves of the side, of what another photo shows; by hand
 
 
+@dataclass(frozen=True)
+class BallShade:
+    """The ball's shadow on the sample: `invrender.capture.ball_shade`; chosen by hand."""
+
+    side: int = 128  # of the sample's square, where lamps throw it
+    coarse: int = 16  # the same, for other light
+    environment_rows: int = 32  # of that
+    screen_cells: int = 16  # of the screen, a side
+    lamp: float = 1e-3  # share of the room's light, from which a texel is a lamp's
+    least: float = 0.03  # share of the light that a shadow takes somewhere
+    darkest: float = 0.02  # share of the light that is left
+    spreads: tuple[float, ...] = (1.0, 0.5, 0.2)  # widths of lamps over those in the environment
+    smooth: float = 1.0  # pixels, before slopes
+    steep: float = 0.1  # of the shadow's greatest slope, where it is compared
+    rounds: int = 10
+    weakest: float = 0.4  # of the shadow's strength, in the photo
+    strongest: float = 1.6
+    most_left: float = 0.9  # share of the photo's slopes, that is left
+    at_once: int = 2_000_000  # pairs of a point and a direction in memory
+
+
 DAMPED_STEPS = DampedSteps()
 BALL_VIEW = BallView()
 BALL_SEARCH = BallSearch()
@@ -625,3 +646,4 @@ VIGNETTING = Vignetting()
 NEAR_LAMP = NearLampSearch()
 HIDDEN_LAMP = HiddenLamp()
 CROP = Crop()
+BALL_SHADE = BallShade()
