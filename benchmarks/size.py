@@ -2,17 +2,22 @@
 
 Every run is a process of its own, as people start it: seconds, processor seconds and peak memory
 are the process's. ``--against DIR`` names a checkout of the commit to compare with; the two take
-turns, and ratios are medians of the rounds' (ours over theirs). Captures are of the same material
-and room at one size of photo (`benchmarks.common.captures`), whose maps are asked for at all sizes.
-Error is that of the average map: shrunk to 256², against the truth at 256²; and, above 256², of the
-band of details that 256² do not hold, over that of having none. A first run has an empty cache of
-kernels. From `ONCE` pixels a side there is one round. A batch is of copies of one capture;
-``inspect`` looks at a JPEG of 48 megapixels.
+turns, and ratios are medians of the rounds' (ours over theirs). Captures have photos of one size
+(`benchmarks.common.captures`); the first one's maps are asked for at all sizes. Error is that of
+the average map up to 1024², of all captures: shrunk to 256², against the truth at 256²; and, above
+256², of the band of details that 256² do not hold, over that of having none. A first run has an
+empty cache of kernels. From `ONCE` pixels a side there is one round. A batch is of copies of one
+capture; ``inspect`` looks at a JPEG of 48 megapixels.
+
+What is measured is kept in runs.json: interrupted, the same command goes on where it was, unless a
+checkout's commit has changed. On two quiet cores of a Xeon it takes half an hour, of which 4096² at
+92290c8 is a third, and five minutes more for each capture that is not there yet.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import shutil
 import statistics
@@ -20,6 +25,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +46,8 @@ from invrender.types import Array
 HERE = Path(__file__).parents[1]
 SMALL = 256  # pixels a side at which maps of all sizes are compared
 SIZES = (256, 512, 1024, 2048, 4096)
-ONCE = 2048  # pixels a side from which there is one round
+ONCE = 512  # pixels a side from which there is one round
+JUDGED = 1024  # pixels a side up to which errors are measured
 PHOTO = 3840  # pixels wide
 BATCH = 20  # captures
 HUGE, QUALITY = 8000, 90  # pixels wide, of 48 megapixels; of its JPEG
@@ -125,7 +132,9 @@ def errors(out: Path, truth: Maps) -> dict[str, float]:
 
 
 def huge_photo(folder: Path, width: int) -> Path:
-    """A capture whose photo is a JPEG of so many pixels."""
+    """A capture whose photo is a JPEG of so many pixels, made if it is not there."""
+    if (folder / "rig.toml").exists():
+        return folder
     shot = make_shot(SEED, kind="jpeg", width=width)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "photo.jpg").write_bytes(jpeg(shot.photo.image, QUALITY))
@@ -135,55 +144,114 @@ def huge_photo(folder: Path, width: int) -> Path:
 
 
 def parser() -> argparse.ArgumentParser:
-    p = arguments(__doc__, "one small procedural capture at 128² and 512²", 1)
+    p = arguments(__doc__, "one small procedural capture at 128² and 512²", 3)
     p.add_argument("--against", type=Path, help="a checkout of the commit to compare with")
-    p.add_argument("--rounds", type=int, default=5, help="runs of each process (5)")
+    p.add_argument("--rounds", type=int, default=3, help="runs of each process (3)")
     p.add_argument("--sizes", type=int, nargs="+", default=SIZES, help="pixels a side of the maps")
     return p
 
 
+@dataclass
+class Runs:
+    """What was measured so far, by process and checkout, kept in a file."""
+
+    file: Path
+    commits: dict[str, str]
+    costs: dict[str, dict[str, list[Cost]]]
+    errors: dict[str, dict[str, list[dict[str, float]]]]
+
+    @classmethod
+    def of(cls, file: Path, checkouts: dict[str, Path]) -> Runs:
+        """Those of the file, if they are of the same commits."""
+        head = ["git", "rev-parse", "HEAD"]
+        commits = {
+            name: subprocess.run(head, cwd=path, capture_output=True, text=True).stdout.strip()
+            for name, path in checkouts.items()
+        }
+        kept = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
+        same = kept.get("commits") == commits
+        return cls(file, commits, *(kept[k] if same else {} for k in ("costs", "errors")))
+
+    def add(self, what: str, checkout: str, cost: Cost, error: dict[str, float] | None) -> None:
+        self.costs.setdefault(what, {}).setdefault(checkout, []).append(cost)
+        if error is not None:
+            self.errors.setdefault(what, {}).setdefault(checkout, []).append(error)
+        self.write()
+
+    def write(self) -> None:
+        content = {k: v for k, v in vars(self).items() if k != "file"}
+        new = self.file.with_suffix(".new")
+        new.write_text(json.dumps(content, indent=1), encoding="utf-8")
+        new.replace(self.file)
+
+
 def main(args: argparse.Namespace) -> None:
     sizes, rounds = ((128, 512), 1) if args.quick else (args.sizes, args.rounds)
-    shape = (256, 960, 8) if args.quick else (1024, PHOTO, 32)
+    shape = (512, 960, 8) if args.quick else (1024, PHOTO, 32)
     real = (None, None) if args.quick else (args.materials, args.envs)
-    folders = make_captures(args.out / "captures", PHOTOGRAPHS, args.count, *shape, *real)
+    count = 1 if args.quick else args.count
+    folders = make_captures(args.out / "captures", PHOTOGRAPHS, count, *shape, *real)
+    huge = huge_photo(args.out / "huge", 1200 if args.quick else HUGE)
+    first = str(folders[0].resolve())
     checkouts = {"this checkout": HERE}
     if args.against:
         checkouts["the other"] = args.against.resolve()
-    costs: dict[str, dict[str, list[Cost]]] = {}
-    found: dict[str, dict[str, list[dict[str, float]]]] = {}
+    runs = Runs.of(args.out / "runs.json", checkouts)
     with tempfile.TemporaryDirectory() as name:
         out = Path(name)
 
-        def turns(what: str, command: Sequence[str], rounds: int, fresh: bool = False) -> None:
-            """Run a command as often as there are rounds with each checkout."""
-            for c, checkout in [*checkouts.items()] * rounds:
-                home = Path(tempfile.mkdtemp(dir=out)) if fresh else None
-                cost = run(checkout, command, out / f"{c} {what}", home)
-                costs.setdefault(what, {}).setdefault(c, []).append(cost)
-                print(what, c, {q: round(v, 2) for q, v in cost.items()}, flush=True)
+        def turns(
+            what: str, command: Sequence[str], rounds: int, fresh: bool = False, judge: bool = False
+        ) -> None:
+            """Run a command with each checkout in turns, until there are so many rounds."""
+            for k in range(rounds):
+                for c, checkout in checkouts.items():
+                    if len(runs.costs.get(what, {}).get(c, [])) > k:
+                        continue
+                    place = out / f"{c} {what}"
+                    home = Path(tempfile.mkdtemp(dir=out)) if fresh else None
+                    cost = run(checkout, command, place, home)
+                    print(what, c, {q: round(v, 2) for q, v in cost.items()}, flush=True)
+                    error = errors(place, truth_of(folders[0])) if judge and k == 0 else None
+                    runs.add(what, c, cost, error)
+                    shutil.rmtree(place, ignore_errors=True)
 
         for checkout in checkouts.values():
             run(checkout, EXAMPLE, out / "warm")  # fills the caches
         for what, command in COMMANDS.items():
             turns(what, command, rounds)
         turns(FIRST, EXAMPLE, rounds, fresh=True)
-        for what, n in ((f"{n}²", n) for n in sizes):
-            for folder in folders:
-                truth = load_capture(folder).truth
-                assert truth is not None
-                words = (*INVRENDER, "refine", str(folder.resolve()), "-o", "OUT", "--size", str(n))
-                turns(what, words, rounds if n < ONCE else 1)
-                for c in checkouts:
-                    error = errors(out / f"{c} {what}", truth)
-                    found.setdefault(what, {}).setdefault(c, []).append(error)
-        batch = [out / f"capture {k:02}" for k in range(3 if args.quick else BATCH)]
+        turns("inspect", (*INVRENDER, "inspect", str(huge.resolve()), "-o", "OUT"), rounds)
+        batch = [out / f"capture {k:02}" for k in range(2 if args.quick else BATCH)]
         for copy in batch:
             shutil.copytree(folders[0], copy)
         turns("batch", (*INVRENDER, "refine", *map(str, batch), "-o", "OUT"), 1)
-        huge = huge_photo(args.out / "huge", 1200 if args.quick else HUGE)
-        turns("inspect", (*INVRENDER, "inspect", str(huge.resolve()), "-o", "OUT"), rounds)
-    report(args.out, costs, found)
+        for n in sizes:
+            words = (*INVRENDER, "refine", first, "-o", "OUT", "--size", str(n))
+            turns(f"{n}²", words, rounds if n < ONCE else 1, judge=n <= JUDGED)
+        for n in (n for n in sizes if n <= JUDGED):
+            judged = runs.errors[f"{n}²"]["this checkout"]
+            for folder in folders[len(judged) :]:
+                command = (
+                    *INVRENDER,
+                    "refine",
+                    str(folder.resolve()),
+                    "-o",
+                    "OUT",
+                    "--size",
+                    str(n),
+                )
+                run(HERE, command, out / "judged")
+                judged.append(errors(out / "judged", truth_of(folder)))
+                print(f"{n}²", folder.name, judged[-1], flush=True)
+                runs.write()
+    report(args.out, runs.costs, runs.errors)
+
+
+def truth_of(folder: Path) -> Maps:
+    truth = load_capture(folder).truth
+    assert truth is not None
+    return truth
 
 
 def median(costs: list[Cost], what: str) -> float:
@@ -191,53 +259,68 @@ def median(costs: list[Cost], what: str) -> float:
 
 
 def report(out: Path, costs: dict[str, dict[str, list[Cost]]], found: dict[str, Any]) -> None:
-    """Write tables, plot and bars."""
+    """Write tables, plot and bars. found: errors by size and checkout, of captures."""
     checkouts = list(next(iter(costs.values())))
+    ours = "this checkout"
     medians = {
         what: {c: {q: median(some, q) for q in QUANTITIES} for c, some in by.items()}
         for what, by in costs.items()
     }
-    ratios = {
-        what: statistics.median(
-            a["seconds"] / b["seconds"] for a, b in zip(*by.values(), strict=True)
-        )
-        for what, by in costs.items()
-        if len(by) == 2
-    }
-    means = {
-        size: {
-            c: {e: float(np.mean([f[e] for f in some])) for e in some[0]} for c, some in by.items()
+    ratios, processor = (
+        {
+            what: statistics.median(a[q] / b[q] for a, b in zip(*by.values(), strict=True))
+            for what, by in costs.items()
+            if len(by) == 2
         }
+        for q in QUANTITIES[:2]
+    )
+    means = {
+        size: {e: float(np.mean([f[e] for f in by[ours]])) for e in by[ours][0]}
         for size, by in found.items()
     }
     rows = [
         [
             what,
             *(by[c][q] for c in checkouts for q in QUANTITIES),
-            *([ratios[what]] if ratios else []),
+            *([ratios[what], processor[what]] if ratios else []),
         ]
         for what, by in medians.items()
     ]
     header = ["", *(f"{q}, {c}" for c in checkouts for q in QUANTITIES)]
+    both = ["seconds, ratio", "processor seconds, ratio"] if ratios else []
+    shown = {"shrunk": "shrunk to 256²", "details": "details"}
     tables = {
-        "processes": table([*header, *(["seconds, ratio"] if ratios else [])], rows),
+        "processes": table([*header, *both], rows),
         "errors": table(
-            ["maps of", *(f"{c}: {e}" for c in checkouts for e in ("shrunk to 256²", "details"))],
-            [[size, *(by[c].get(e) for c in checkouts for e in ("shrunk", "details"))]
-             for size, by in means.items()],
+            [
+                "maps of",
+                "captures",
+                *shown.values(),
+                *(f"{e}, the first one, {c}" for c in checkouts for e in shown.values()),
+            ],
+            [
+                [
+                    size,
+                    len(found[size][ours]),
+                    *(of.get(e) for e in shown),
+                    *(found[size][c][0].get(e) for c in checkouts for e in shown),
+                ]
+                for size, of in means.items()
+            ],
         ),
-    }  # fmt: skip
-    sizes = [int(size[:-1]) for size in found]
+    }
+    sizes = [int(size[:-1]) for size in costs if size.endswith("²")]
     panels: dict[str, Any] = {
         q: {c: (sizes, [medians[f"{n}²"][c][q] for n in sizes]) for c in checkouts}
         for q in QUANTITIES
     }
     panels["average map RMSE, shrunk to 256²"] = {
-        c: (sizes, [means[f"{n}²"][c]["shrunk"] for n in sizes]) for c in checkouts
+        ours: ([int(size[:-1]) for size in means], [of["shrunk"] for of in means.values()])
     }
     plot_error_over_time(out / "size.png", panels, x="pixels a side", y="", columns=2)
     results = {"medians": medians, "ratios": ratios, "errors": means}
-    write_results(out, {**results, "costs": costs, "bars": bars(results)}, tables)
+    kept = {"processor_ratios": processor, "costs": costs, "errors_of_captures": found}
+    write_results(out, {**results, **kept, "bars": bars(results)}, tables)
 
 
 def bars(results: dict[str, Any]) -> list[Bar]:
@@ -251,7 +334,7 @@ def bars(results: dict[str, Any]) -> list[Bar]:
     ours = {what: by["this checkout"] for what, by in medians.items()}
     found += [bar(f"{what}: GB", ours[what]["GB"], most, False)
               for what, most in MEMORY_BARS.items() if what in ours]  # fmt: skip
-    small, large = (means.get(f"{n}²", {}).get("this checkout") for n in (SMALL, 1024))
+    small, large = (means.get(f"{n}²") for n in (SMALL, 1024))
     if small and large:
         ratio = large["shrunk"] / small["shrunk"]
         found.append(bar("average error at 1024², shrunk, over that at 256²", ratio, 1.03, False))

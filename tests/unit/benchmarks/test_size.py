@@ -56,6 +56,16 @@ def test_errors_of_a_result_are_at_the_small_size(tmp_path):
     assert size.errors(tmp_path, truth)["shrunk"] == pytest.approx(expected, rel=1e-3)
 
 
+def test_what_was_measured_is_kept_for_the_same_commits(tmp_path):
+    file, checkouts = tmp_path / "runs.json", {"this checkout": size.HERE}
+    cost = {"seconds": 4.0, "processor seconds": 5.0, "GB": 1.0}
+    size.Runs.of(file, checkouts).add("256²", "this checkout", cost, {"shrunk": 0.05})
+    again = size.Runs.of(file, checkouts)
+    assert again.costs == {"256²": {"this checkout": [cost]}}
+    assert again.errors["256²"]["this checkout"] == [{"shrunk": 0.05}]
+    assert size.Runs.of(file, {**checkouts, "the other": size.HERE}).costs == {}
+
+
 def test_bars_need_another_checkout_for_ratios(tmp_path):
     cost = {"seconds": 4.0, "processor seconds": 5.0, "GB": 1.0}
     costs = {what: {"this checkout": [cost]} for what in ("refine example", "256²", "1024²")}
