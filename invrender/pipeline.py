@@ -318,13 +318,14 @@ def _ask_networks(
     priors = [network_prior(e.maps, e.sigma) for e in estimates]
     alone = len(photos) == 1 or measured
     known = lobes.maps if lobes is not None and alone else None
-    return Initial(start, pooled(priors), asked[0], known, interrupted)
+    return Initial(start, pooled(priors), photos[asked[0]], known, interrupted)
 
 
 def _registered(
     photos: Sequence[Observation], own: Sequence[Sample], crops: Sequence[Sample], mean: Array
 ) -> list[Observation]:
-    """The photos cut out again where maps θ, ``mean``, find them, their factors divided out."""
+    """The photos cut out again where maps θ, ``mean``, find them, their factors divided out; sharp,
+    which those that networks are asked about are not, as these know them."""
     from invrender.refine.registration import factor_image, register
 
     found, result = register(photos, mean), []
@@ -332,7 +333,7 @@ def _registered(
         photos, own, crops, found.places, found.factors, strict=True
     ):
         before = np.eye(3) if crop.place is None else crop.place
-        again = sample.placed(before @ place)
+        again = sample.placed(before @ place, sharp=True)
         shown = again.photo / factor_image(factor, *again.photo.shape[:2])
         clipped = again.clipped if again.clipped.any() else None
         result.append(replace(photo, photo=shown, clipped=clipped))

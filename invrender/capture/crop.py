@@ -25,9 +25,14 @@ def crop_sample(photo: Photo, rig: Rig, size: int = 256) -> Array:
     return crop_part(photo, rig, size)
 
 
-def crop_part(photo: Photo, rig: Rig, size: int, place: Array | None = None) -> Array:
+def crop_part(
+    photo: Photo, rig: Rig, size: int, place: Array | None = None, sharp: bool = False
+) -> Array:
     """As `crop_sample`, of another part of the table: where the homography ``place`` (3, 3) takes
     the sample's square, [-1, 1]², x right and y up. What is beyond the photo is its border.
+
+    sharp: the photo is the spline whose means over its pixels are the photo's values, so that
+    neither the size of these nor interpolation blurs.
     """
     if size < 1:
         raise InputError(f"the sample's size must be at least one pixel, got {size}")
@@ -38,17 +43,18 @@ def crop_part(photo: Photo, rig: Rig, size: int, place: Array | None = None) -> 
     x1, y1 = np.clip(np.ceil(high).astype(int) + CROP.margin, 1, [w, h])
     crop = photo.image[y0:y1, x0:x1]
     scale = float((high - low).max()) / size  # photo pixels in one of the crop's
-    samples = min(max(1, math.ceil(scale)), CROP.samples)
+    samples = min(max(CROP.sharp_samples if sharp else 1, math.ceil(scale)), CROP.samples)
     wide = 2 * round((scale / samples - 1) / 2) + 1  # odd, so that nothing moves
     order = 3 if scale < CROP.spline_scale else 1  # the mean over many pixels needs no splines
     planes = [np.asarray(crop[..., c], np.float32) for c in range(3)]
     if wide > 1:
         planes = [ndimage.uniform_filter(plane, wide, mode="nearest") for plane in planes]
     around = 0
-    if order > 1:  # as `map_coordinates` does it, but once for all bands
+    spline = order + sharp  # a spline's means over pixels are values of the one of the next order
+    if spline > 1:  # as `map_coordinates` does it, but once for all bands
         around = CROP.spline_margin
         planes = [
-            ndimage.spline_filter(np.pad(p, around, mode="edge"), order, mode="nearest")
+            ndimage.spline_filter(np.pad(p, around, mode="edge"), spline, mode="nearest")
             for p in planes
         ]
     # Next to the border the lens mixes in what lies around the sample, often white paper.

@@ -51,13 +51,13 @@ class Sample:
         clipped = resize(self.clipped.astype(np.float32), height, width) > 0
         return replace(self, photo=resize(self.photo, height, width), clipped=clipped)
 
-    def placed(self, place: Array) -> Sample:
+    def placed(self, place: Array, sharp: bool = False) -> Sample:
         """The square of the sample that lies where a homography takes this one's own, with the
-        lights as they are seen from there."""
-        if self.whole is None or np.array_equal(place, np.eye(3)):
+        lights as they are seen from there; sharp: of `crop_part`."""
+        if self.whole is None or (np.array_equal(place, np.eye(3)) and not sharp):
             return self
         rig, size = self.lights.rig, len(self.photo)
-        crop = crop_part(self.whole, rig, size, place)
+        crop = crop_part(self.whole, rig, size, place, sharp)
         clipped = crop_mask(self.whole, rig, size, place)
         return Sample(crop, clipped, self.lights.placed(place), None, place)
 

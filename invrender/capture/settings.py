@@ -586,6 +586,7 @@ class Crop:
     """The sample cut out of the photo: `invrender.capture.crop`."""
 
     samples: int = 8  # a side of a pixel, at most; beyond, the photo is smoothed first; by hand
+    sharp_samples: int = 3  # and at least, of a sharp crop: its means are means over the pixels
     margin: int = 8  # pixels around the sample's square; by hand
     mask_margin: int = 10  # the same, of the saturated pixels; by hand
     spline_scale: float = 2.0  # photo pixels in a pixel, below which splines are used; by hand

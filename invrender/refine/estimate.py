@@ -39,13 +39,13 @@ CONTRADICTED = 0.5
 class Initial:
     """Maps before the photos are explained.
 
-    asked: the photo that networks know best, None where no network knows the sample. lobes: what
-    the light's pattern says of this photo, if it was asked alone.
+    asked: the photo that networks know best, as they were shown it; None where no network knows the
+    sample. lobes: what the light's pattern says of this photo, if it was asked alone.
     """
 
     maps: Maps
     prior: Prior
-    asked: int | None = None
+    asked: Observation | None = None
     lobes: Maps | None = None
     interrupted: bool = False
 
@@ -93,7 +93,7 @@ def explain_photos(
     if initial.asked is None and not measured:
         return refine(photos, prior, samples=samples, progress=step), kept
     if initial.asked is not None:
-        few = [photos[initial.asked]] if measured else photos
+        few = [initial.asked] if measured else photos
         result, observed = _explain_few(few, initial, samples)
         if not measured:
             return result, observed

@@ -59,6 +59,12 @@ class Settings:
     slopes: tuple[float, ...] = (0.35, 0.9)
     directions: int = 6
     steps: int = 8  # at most
+    # Of what is found of a material's roughness, the share of the spread that is the pixels' own,
+    # as materials are told apart for the first and for the second time; photos' errors are the
+    # rest. A third time changes maps by 0.5%.
+    spread: tuple[float, ...] = (1.0, 0.25)
+    least_roughness: float = 0.015  # that deviation, at least
+    expected_slopes: float = 2.0  # times what is expected of the initial slopes' errors
     few: int = 3  # steps where a smaller size was solved before
     stop: float = 0.003  # relative decrease of the cost below which steps end
     trust: tuple[float, float, float] = (0.3, 0.15, 0.3)  # most that a step moves k, ρ, slopes

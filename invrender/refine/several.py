@@ -13,7 +13,7 @@ photos say of all pixels of the material together (`invrender.refine.shared_roug
 
 Each photo's noise and its exposure are what the others leave of it: Rᵢ grows with its residuals,
 and a factor a colour is taken out. A photo whose residuals are far beyond the others' is left out.
-A pixel's noise is at least as large as what θ leaves of its photos; with it the initial maps and
+A pixel's noise is at least as large as what θ leaves of its photos; with it the initial slopes and
 their expected errors count as well, most where no θ explains the photos.
 """
 
@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
@@ -36,7 +36,6 @@ from invrender.refine.pixels import (
     Settings,
     free_share,
     noise_of,
-    precision_of,
     wide_deviations,
 )
 from invrender.refine.priors import Prior, channel_correlation
@@ -81,6 +80,18 @@ def plain_prior(observations: Sequence[Observation], samples: int, s: Settings =
     return Prior(theta, sigma, channel_correlation(*s.correlation))
 
 
+@dataclass
+class Found:
+    """The mode θ (H, W, 9) of the pixels under materials and their priors; maps and their expected
+    errors, of what that and the initial maps say; the photos' errors; and whether it converged."""
+
+    mode: Array
+    theta: Array
+    sigma: Array
+    photo_errors: list[float]
+    converged: bool = True
+
+
 def explain_together(
     observations: Sequence[Observation],
     prior: Prior,
@@ -96,22 +107,44 @@ def explain_together(
     """
     began = time.perf_counter()
     theta = project(prior.mean.copy())
-    sigma = prior.expected.copy()
-    result = Refined(to_maps(theta), sigma)
+    result = Refined(to_maps(theta), prior.expected.copy())
     try:
-        photos, left_out = _calibrate(observations, theta, samples, s)
+        photos, result.left_out = _calibrate(observations, theta, samples, s)
         progress(0.1)
-        pooled = _pool(photos, theta, sigma[..., R], samples, s)
-        s = replace(s, slope=_relief(photos, pooled, theta, samples, s))
-        progress(0.4)
-        errors, result.converged = _solve_all(photos, pooled, theta, sigma, samples, s)
-        result.photo_errors, result.left_out = errors, left_out
-        error = float(np.sqrt(np.mean(np.square(errors))))
+        found = _explain_all(photos, theta, prior.expected, samples, progress, s)
+        result.maps, result.sigma = to_maps(found.theta), found.sigma
+        result.photo_errors, result.converged = found.photo_errors, found.converged
+        error = float(np.sqrt(np.mean(np.square(found.photo_errors))))
         result.history = [{"seconds": time.perf_counter() - began, "photo_error": error}]
     except KeyboardInterrupt:
         result.interrupted = True
-    result.maps = to_maps(theta)
     return result
+
+
+def _explain_all(
+    photos: Sequence[Photo], theta: Array, sigma: Array, samples: int,
+    progress: Callable[[float], None], s: Settings,
+) -> Found:  # fmt: skip
+    """From initial maps θ and their expected errors. A large image starts from itself shrunk."""
+    height, width = theta.shape[:2]
+    if max(height, width) > s.whole:
+        scale = s.whole / max(height, width)
+        low = max(1, round(height * scale)), max(1, round(width * scale))
+        coarse = project(resize(theta, *low))
+        few = [p.shrunk(*low) for p in photos]
+        found = _explain_all(few, coarse, resize(sigma, *low), samples, progress, s)
+        mode, shares = project(theta + resize(found.mode - coarse, height, width)), s.spread[-1:]
+    else:
+        mode, shares = theta, s.spread
+    pooled = _pool(photos, theta, mode, sigma[..., R], samples, s)
+    s = replace(s, slope=_relief(photos, pooled, theta, samples, s))
+    for k, own in enumerate(shares):
+        if k:  # materials are told apart by what was found, in which there is less light
+            pooled = _pool(photos, theta, mode, sigma[..., R], samples, s)
+        found = _solve_all(photos, pooled, own, theta, mode, sigma, samples, s)
+        mode = found.mode
+        progress(0.1 + 0.9 * (k + 1) / len(shares))
+    return found
 
 
 def _small(photos: Sequence[Photo], theta: Array, rho: float, samples: int, s: Settings) -> Problem:
@@ -162,11 +195,14 @@ def _calibrate(
     return noisy, [i for i in range(len(observations)) if i not in photos]
 
 
-def _pool(photos: Sequence[Photo], theta: Array, sigma: Array, samples: int, s: Settings) -> Pooled:
-    """The roughness of the sample's materials; sigma: the error (H, W) that is expected of θ's."""
+def _pool(
+    photos: Sequence[Photo], theta: Array, mode: Array, sigma: Array, samples: int, s: Settings
+) -> Pooled:
+    """The roughness of the sample's materials, which are told apart by what was found, ``mode``;
+    sigma: the error (H, W) that is expected of θ's roughness."""
     problem = _small(photos, theta, s.fixed, samples, s)
     size = problem.mean.shape[:2]
-    few = sigma[np.ix_(*(centres(n, of) for n, of in zip(size, sigma.shape, strict=True)))]
+    at = np.ix_(*(centres(n, of) for n, of in zip(size, sigma.shape, strict=True)))
 
     def solve(rho: float, start: Array) -> tuple[Array, Array]:
         problem.mean[..., R] = rho
@@ -175,8 +211,14 @@ def _pool(photos: Sequence[Photo], theta: Array, sigma: Array, samples: int, s: 
         point, _ = problem.solve(start, s.tried)
         return point.theta, point.cost
 
-    first = problem.mean.copy()
-    return pool_roughness(first, few, solve)
+    return pool_roughness(_features_of(mode, theta)[at], sigma[at], solve)
+
+
+def _features_of(mode: Array, theta: Array) -> Array:
+    """By what materials are told apart: what was found, but the initial roughness."""
+    both = mode.copy()
+    both[..., R] = theta[..., R]
+    return both
 
 
 def _relief(
@@ -195,12 +237,13 @@ def _relief(
 
 
 def _solve_all(
-    photos: Sequence[Photo], pooled: Pooled, theta: Array, sigma: Array, samples: int, s: Settings
-) -> tuple[list[float], bool]:
-    """Solve all pixels, θ and its deviations in place; the photos' errors, and whether it
-    converged. A large image starts from itself shrunk."""
+    photos: Sequence[Photo], pooled: Pooled, own: float, theta: Array, mode: Array, sigma: Array,
+    samples: int, s: Settings,
+) -> Found:  # fmt: skip
+    """Solve all pixels, from ``mode``; own: the share of roughness' spread that is the pixels'."""
     height, width = theta.shape[:2]
-    rho, spread = pooled.roughness(theta)
+    rho, spread = pooled.roughness(_features_of(mode, theta))
+    spread = np.maximum(own * spread, s.least_roughness)
     mean = theta.copy()
     mean[..., R] = rho
     prior = wide_deviations(mean, spread, s)
@@ -208,53 +251,52 @@ def _solve_all(
     prior[..., D] = np.minimum(
         prior[..., D], np.maximum(s.trusted * sigma[..., D], s.least_diffuse)
     )
-    start, steps = mean, s.steps
-    if max(height, width) > s.whole:
-        scale = s.whole / max(height, width)
-        low = max(1, round(height * scale)), max(1, round(width * scale))
-        coarse = project(resize(theta, *low))
-        before = coarse.copy()
-        before[..., R] = pooled.roughness(coarse)[0]
-        few = [p.shrunk(*low) for p in photos]
-        _solve_all(few, pooled, coarse, resize(sigma, *low), samples, s)
-        start, steps = project(mean + resize(coarse - before, height, width)), s.few
-    squares, seen, converged = np.zeros(len(photos)), np.zeros(len(photos)), True
+    found = Found(mode.copy(), theta.copy(), sigma.copy(), [])
+    found.mode[..., R] = rho
+    squares, seen = np.zeros(len(photos)), np.zeros(len(photos))
+    large = max(height, width) > s.whole
     rows = max(1, BAND // width)
     for top in range(0, height, rows):
         band = slice(top, min(top + rows, height))
         problem = Problem(photos, mean[band], prior[band], band, height, samples, s)
-        go = problem.search if start is mean else problem.solve
-        point, done = go(start[band], steps)
-        converged &= done
-        found, covariance = _weighed(problem, point, theta[band], sigma[band])
-        theta[band] = project(found)
+        solve, steps = (problem.solve, s.few) if large else (problem.search, s.steps)
+        point, done = solve(found.mode[band], steps)
+        found.converged &= done
+        found.mode[band] = point.theta
+        weighed, covariance = _weighed(problem, point, theta[band], sigma[band])
+        found.theta[band] = project(weighed)
         variance = np.einsum("hwpp->hwp", covariance)
         variance[..., :6] += (s.lights_error * point.theta[..., :6]) ** 2
-        sigma[band] = np.sqrt(variance)
+        found.sigma[band] = np.sqrt(variance)
         for i, photo in enumerate(photos):
             o = photo.observation
-            image, _ = linearise(o.renderer, theta[band], samples, top=top, height=height)
+            image, _ = linearise(o.renderer, found.theta[band], samples, top=top, height=height)
             use = np.ones(image.shape[:2], bool) if o.clipped is None else ~o.clipped[band]
             squares[i] += float(((o.photo[band] - image)[use] ** 2).mean(-1).sum(dtype=np.float64))
             seen[i] += use.sum()
     means = np.array([p.mean for p in photos])
-    return list(np.sqrt(squares / np.maximum(seen, 1)) / means), converged
+    found.photo_errors = list(np.sqrt(squares / np.maximum(seen, 1)) / means)
+    return found
 
 
 def _weighed(
     problem: Problem, point: Point, initial: Array, expected: Array
 ) -> tuple[Array, Array]:
     """θ (h, W, 9) and its covariance, with noise as large as what θ leaves of a pixel's photos, and
-    with the initial maps and their expected errors.
+    with the initial slopes and their expected errors.
 
     What no θ explains, such as relief finer than a pixel, has measured little: there the initial
-    maps count for most.
+    slopes count for most, and the prior for the rest.
     """
     s = problem.s
-    misfit = np.minimum(point.misfit, s.most_misfit).mean(0) / free_share(len(point.misfit))
-    misfit = np.maximum(misfit, ndimage.uniform_filter(misfit, s.around, mode="nearest"))
-    excess = np.maximum(misfit, 1.0)[..., None]
-    wide, known = problem.prior_precision(), precision_of(expected, s)
+    misfit = np.minimum(point.misfit, s.most_misfit)
+    trust = ((1 + misfit / s.unlikely) ** -2).mean(0)  # what it counts for already
+    misfit = misfit.mean(0) / free_share(len(misfit))
+    misfit = np.maximum(misfit, ndimage.median_filter(misfit, s.around, mode="nearest"))
+    excess = np.maximum(misfit * trust, 1.0)[..., None]
+    wide, slopes = problem.prior_precision(), np.arange(9)[N]
+    known = np.zeros_like(wide)
+    known[..., slopes, slopes] = 1 / (s.expected_slopes * expected[..., N]) ** 2
     drawn = np.einsum("hwpq,hwq->hwp", wide, point.theta - problem.mean)
     data = (point.hessian - wide) / excess[..., None]
     pull = (point.gradient + drawn) / excess - drawn

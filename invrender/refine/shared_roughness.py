@@ -32,7 +32,7 @@ class Settings:
     least: int = 40  # pixels of a group
     steps: int = 60  # of EM, which settles within 30
     known: float = 0.2  # what the prior counts for, as a share of the group's pixels
-    temper: float = 0.5  # of a pixel's log-likelihoods: neighbours share their errors
+    temper: float = 0.1  # of a pixel's log-likelihoods: photos and neighbours share their errors
     least_spread: float = 0.03  # of ρ within a material
     roughness_weight: float = 0.5  # of ρ against the roots of the albedos, as pixels are grouped
 
@@ -68,7 +68,8 @@ def pool_roughness(
     solve: Callable[[float, Array], tuple[Array, Array]],
     s: Settings = POOLING,
 ) -> Pooled:
-    """The materials of pixels with initial maps θ (H, W, 9) and their roughness.
+    """The materials of pixels with maps θ (H, W, 9), their roughness still the initial one; and the
+    materials' own.
 
     sigma: the expected error (H, W) of the initial roughness, which counts where photos say
     nothing. solve: from a roughness and θ to start from to the pixels' best θ with it and -2

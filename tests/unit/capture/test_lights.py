@@ -9,7 +9,7 @@ from synthetic_photo import blocks, grey_table, light_from, photograph, sky, tex
 from invrender.capture import ball as ball_module
 from invrender.capture.ball import find_ball
 from invrender.capture.ball_image import trace_ball
-from invrender.capture.crop import crop_sample
+from invrender.capture.crop import crop_part, crop_sample
 from invrender.capture.environment import fill_environment
 from invrender.capture.lights import level_table, measure_lights
 from invrender.capture.mirror import (
@@ -417,6 +417,26 @@ def test_a_tilted_camera_gives_the_same_crop(tilt, folder):
         crops.append(crop_sample(capture.photo, capture.rig, 200))
     assert np.sqrt(np.mean((crops[0] - crops[1]) ** 2)) < 0.003
     assert np.abs(crops[0] - crops[1]).max() < 0.02
+
+
+@pytest.mark.parametrize("size", [80, 160])
+def test_a_sharp_crop_is_the_mean_over_its_pixels(size):
+    """Of waves, which a mean over a length shrinks by a sinc: the photo's pixels do as well."""
+    wave = 2 * np.pi * size / RIG.sample_size / 4  # four of the crop's pixels long
+    pixel = RIG.sample_size / np.ptp(RIG.project(RIG.sample_corners, *SIZE), axis=0)[0]
+
+    def shown(p, length):
+        mean = np.sinc(wave * length / (2 * np.pi)) ** 2
+        return 0.5 + 0.4 * mean * np.cos(wave * p[..., :1]) * np.cos(wave * p[..., 1:2]) + [0.0] * 3
+
+    photo = Photo(photograph(RIG, *SIZE, table=lambda p: shown(p, pixel), ball=None))
+    truth = shown(RIG.sample_points(size, size), RIG.sample_size / size)
+    inner = slice(8, -8)
+    plain, sharp = (
+        np.sqrt(np.mean((crop_part(photo, RIG, size, None, s) - truth)[inner, inner] ** 2))
+        for s in (False, True)
+    )
+    assert sharp < 0.35 * plain, (sharp, plain)
 
 
 def test_crop_does_not_alias():

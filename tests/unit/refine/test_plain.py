@@ -166,7 +166,7 @@ def test_the_whole_refinement_does_both(renderer):
     photo, prior = asked(renderer, 1.02)
     noise = 0.04 * np.random.default_rng(2).standard_normal(photo.photo.shape)
     photo = replace(photo, photo=(photo.photo * (1 + noise)).astype(np.float32))
-    start = Initial(flat(), replace(prior, mean=to_theta(flat())), asked=0)
+    start = Initial(flat(), replace(prior, mean=to_theta(flat())), asked=photo)
     result, (shot,) = explain_photos([photo], start, 64, lambda s: None, lambda i, e: None)
     found = result.maps.diffuse
     np.testing.assert_allclose(found.mean((0, 1)), ALBEDO, rtol=0.005)
@@ -184,6 +184,6 @@ def test_a_few_pixels_are_numbers(renderer, shape):
     few = tuple(slice(n) for n in shape)
     start = Prior(prior.mean[few], prior.sigma[few], prior.correlation)
     photo = replace(photo, photo=photo.photo[few])
-    initial = Initial(to_maps(start.mean), start, asked=0)
+    initial = Initial(to_maps(start.mean), start, asked=photo)
     result, _ = explain_photos([photo], initial, 64, lambda s: None, lambda i, e: None)
     assert all(np.isfinite(m).all() for m in (*vars(result.maps).values(), result.sigma))

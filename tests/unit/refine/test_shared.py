@@ -188,8 +188,8 @@ def test_a_shadow_that_the_lights_do_not_have_is_no_material(renderer, shadow, p
     photo = renderer.render(maps)
     photo[:, SIZE // 2 :] *= shadow
     first = replace(maps, roughness=maps.roughness + 0.03)
-    initial = Initial(first, prior_of(first), asked=0)
     seen = [Observation(photo, renderer), Observation(renderer.render(maps), renderer)][:photos]
+    initial = Initial(first, prior_of(first), asked=seen[0])
     found, _ = explain_photos(seen, initial, 64, print, print)
     moved = np.abs(found.maps.diffuse - first.diffuse).max() > 0
     assert found.contradicted == (shadow < 1) and moved == (shadow == 1)
