@@ -18,7 +18,7 @@ from invrender.refine.flat import flat_maps
 from invrender.refine.gauss_newton import Observation, Refined, refine
 from invrender.refine.lobes import fit_lobes
 from invrender.refine.mirrors import take_mirrors
-from invrender.refine.plain import evened, keep_level
+from invrender.refine.plain import evened, keep_level, likely_relief
 from invrender.refine.posterior import explain
 from invrender.refine.priors import Prior, lobe_prior
 from invrender.refine.several import explain_together, plain_prior
@@ -110,7 +110,7 @@ def _explain_few(
     prior = initial.prior
     if initial.lobes is not None:
         prior = take_mirrors(photos[0], prior, initial.lobes, samples=samples)
-    known = share(photos, prior, samples=samples)
+    known = share(photos, likely_relief(prior), samples=samples)
     if known.interrupted:
         result = Refined(to_maps(known.prior.mean), known.prior.expected, interrupted=True)
         result.factors = known.factors

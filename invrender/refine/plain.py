@@ -8,6 +8,9 @@
   There is no texture where neighbouring pixels hardly vary together: then the albedo's variation is
   noise too, and none is kept.
 
+- **Relief.** A network's slopes are wrinkles of its own where all of them are shallow; else it sees
+  their wide shades too steep, which the light's resemble, and the details too shallow.
+
 The level and the albedo's variation are shrunk by what is expected of such errors, c, as a change
 or a deviation x: by 1 - (c/x)² or the square of that, and wholly below c (Breiman's garrote, 1995).
 What is well above stays.
@@ -24,7 +27,7 @@ from scipy.ndimage import gaussian_filter
 from invrender.refine.gauss_newton import Observation
 from invrender.refine.priors import Prior
 from invrender.refine.shared import KNOWN, material_means
-from invrender.refine.theta import D, R, dielectric_share, is_dielectric, project
+from invrender.refine.theta import D, N, R, dielectric_share, is_dielectric, project
 from invrender.sampling import resize
 from invrender.types import TINY, Array
 
@@ -33,19 +36,35 @@ from invrender.types import TINY, Array
 class Settings:
     """Chosen by hand on 66 simulated photographs (docs/research-log/2026-11-30-plain-samples.md),
     what is kept of roughness on 113 (docs/research-log/2026-11-30-roughness-kept-and-found.md),
-    levels on these (docs/research-log/2026-11-30-levels-of-jpegs.md)."""
+    levels and relief on these (docs/research-log/2026-11-30-levels-of-jpegs.md,
+    docs/research-log/2026-11-30-what-slopes-mean.md)."""
 
     level: float = 0.01  # of the lights' strength in each colour, that is not told, at least
     of_gain: float = 0.6  # and of what the screen's is known to (`Observation.level`)
     fine: float = 1 / 16  # of the side: the Gaussian beyond which a detail of roughness is shade
     dark: float = 0.01  # added to the albedo, whose logarithm such details are compared with
     roughness: float = 0.2  # of the other details that is kept
+    wrinkles: float = 0.012  # slopes, RMS of a sample, of which half are
+    wide: float = 1 / 64  # of the side: the Gaussian of slopes' wide shades
+    slopes: tuple[float, float] = (0.65, 1.1)  # true over found, of wide shades and of details
     side: int = 256  # pixels a side of which neighbours are compared
     contrast: tuple[float, float] = (0.03, 0.003)  # they share on plain samples: of k_d; at least
     alone: float = 0.4  # of a pixel's own deviation, that counts too: a weave's neighbours differ
 
 
 PLAIN_SETTINGS = Settings()
+
+
+def likely_relief(prior: Prior, s: Settings = PLAIN_SETTINGS) -> Prior:
+    """The prior with the slopes that a network's are likely to mean."""
+    mean = prior.mean.copy()
+    slopes = mean[..., N]
+    wide = gaussian_filter(slopes, (*(s.wide * n for n in mean.shape[:2]), 0))
+    square = float(np.mean(slopes**2))
+    of_wide, of_fine = s.slopes
+    mean[..., N] = of_wide * wide + of_fine * (slopes - wide)
+    mean[..., N] *= square / (square + s.wrinkles**2)
+    return replace(prior, mean=project(mean))
 
 
 def keep_level(

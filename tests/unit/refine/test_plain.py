@@ -10,9 +10,9 @@ from invrender.maps import constant_maps
 from invrender.pattern.default import default_pattern
 from invrender.refine.estimate import Initial, explain_photos
 from invrender.refine.gauss_newton import Observation
-from invrender.refine.plain import PLAIN_SETTINGS, evened, keep_level
+from invrender.refine.plain import PLAIN_SETTINGS, evened, keep_level, likely_relief
 from invrender.refine.priors import Prior, network_prior
-from invrender.refine.theta import D, R, S, project, to_maps, to_theta
+from invrender.refine.theta import D, N, R, S, project, to_maps, to_theta
 from invrender.render.fast.estimator import Fast
 from invrender.render.scene import make_scene
 from invrender.rig import Rig
@@ -30,6 +30,26 @@ def renderer():
 
 def flat(k_d=ALBEDO, k_s=0.04):
     return constant_maps(SIZE, SIZE, k_d, k_s, 0.6)
+
+
+def waves(height, cycles):
+    """The slopes of a flat sample's prior, so high, after `likely_relief`, over those before."""
+    theta = to_theta(flat())
+    theta[..., N.start] = height * np.sin(np.arange(SIZE) / SIZE * 2 * np.pi * cycles)
+    ones = np.ones_like(theta)
+    found = likely_relief(Prior(theta, ones, np.eye(9))).mean
+    np.testing.assert_array_equal(found[..., :7], theta[..., :7])
+    assert not found[..., N.start + 1].any()
+    before = theta[..., N.start]
+    return float((found[..., N.start] * before).sum() / (before**2).sum())
+
+
+def test_relief_keeps_its_details_and_little_of_wrinkles_and_wide_shades():
+    wide, fine = PLAIN_SETTINGS.slopes
+    assert waves(0.3, 1) == pytest.approx(wide, abs=0.03)
+    assert waves(0.3, 40) == pytest.approx(fine, abs=0.03)
+    assert waves(2 * PLAIN_SETTINGS.wrinkles, 40) == pytest.approx(fine / 2, abs=0.02)
+    assert waves(0.002, 40) < 0.02
 
 
 LEVEL = 0.05  # of the photos' lights
