@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from itertools import pairwise
 
 import numpy as np
+from scipy.linalg import solve_banded
 from scipy.ndimage import uniform_filter
 from scipy.sparse import eye_array
 
@@ -36,6 +37,7 @@ LIGHT_SAMPLES = 64  # of the specular lobe
 LARGE_SAMPLES = 16  # of the specular lobe, in the rendering of maps that are large: noise of 1%
 # Pixels a side up to which a photo's noise is white: beyond, it is interpolated. By hand.
 WHITE_UP_TO = 1024
+REACH = 1  # pixel, of an image that is enlarged and shrunk again
 BELOW = 2  # octaves below the details that are looked at too
 WHOLE_OCTAVE = 3.5  # areas, of the one below, of an octave that tells noise
 MOST_RISE = 1.0  # of a texture's variance from an octave to the next: noise has four; by hand
@@ -224,8 +226,12 @@ def _sharpened(image: Array, height: int, width: int) -> Array:
     for axis, size in enumerate((height, width)):
         few = image.shape[axis]
         if few < size:
-            there_and_back = (resize_weights(size, few) @ resize_weights(few, size)).toarray()
-            flat = np.swapaxes(image, 0, axis).reshape(few, -1)
-            sharp = np.linalg.solve(there_and_back, flat).reshape(np.swapaxes(image, 0, axis).shape)
-            image = np.swapaxes(sharp, 0, axis)
+            there_and_back = resize_weights(size, few) @ resize_weights(few, size)
+            diagonals = np.zeros((2 * REACH + 1, few), np.float32)
+            for k in range(-REACH, REACH + 1):
+                part = there_and_back.diagonal(k)
+                diagonals[REACH - k, max(k, 0) : max(k, 0) + len(part)] = part
+            flat = np.swapaxes(image, 0, axis)
+            sharp = solve_banded((REACH, REACH), diagonals, flat.reshape(few, -1))
+            image = np.swapaxes(sharp.reshape(flat.shape), 0, axis)
     return np.ascontiguousarray(image, np.float32)
