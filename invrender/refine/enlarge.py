@@ -37,7 +37,7 @@ LIGHT_SAMPLES = 64  # of the specular lobe
 LARGE_SAMPLES = 16  # of the specular lobe, in the rendering of maps that are large: noise of 1%
 # Pixels a side up to which a photo's noise is white: beyond, it is interpolated. By hand.
 WHITE_UP_TO = 1024
-REACH = 1  # pixel, of an image that is enlarged and shrunk again
+COUPLED = 1  # pixel, of an image that is enlarged and shrunk again
 BELOW = 2  # octaves below the details that are looked at too
 WHOLE_OCTAVE = 3.5  # areas, of the one below, of an octave that tells noise
 MOST_RISE = 1.0  # of a texture's variance from an octave to the next: noise has four; by hand
@@ -227,11 +227,11 @@ def _sharpened(image: Array, height: int, width: int) -> Array:
         few = image.shape[axis]
         if few < size:
             there_and_back = resize_weights(size, few) @ resize_weights(few, size)
-            diagonals = np.zeros((2 * REACH + 1, few), np.float32)
-            for k in range(-REACH, REACH + 1):
+            diagonals = np.zeros((2 * COUPLED + 1, few), np.float32)
+            for k in range(-COUPLED, COUPLED + 1):
                 part = there_and_back.diagonal(k)
-                diagonals[REACH - k, max(k, 0) : max(k, 0) + len(part)] = part
+                diagonals[COUPLED - k, max(k, 0) : max(k, 0) + len(part)] = part
             flat = np.swapaxes(image, 0, axis)
-            sharp = solve_banded((REACH, REACH), diagonals, flat.reshape(few, -1))
+            sharp = solve_banded((COUPLED, COUPLED), diagonals, flat.reshape(few, -1))
             image = np.swapaxes(sharp.reshape(flat.shape), 0, axis)
     return np.ascontiguousarray(image, np.float32)
