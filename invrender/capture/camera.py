@@ -17,6 +17,8 @@ from typing import Any
 
 import numpy as np
 from scipy import ndimage
+from scipy.signal import fftconvolve
+from scipy.spatial.transform import Rotation
 
 from invrender.capture.ball_image import sample_image
 from invrender.capture.ball_view import View, view_around
@@ -61,7 +63,19 @@ def _find(photo: Photo, rig: Rig) -> Array | None:
     pose: Array = np.zeros(6)
     if np.all(nominal.median > SQUARE_FIT.nominal) and nominal.clear():
         return pose  # all four: no need to look elsewhere
-    border = _border(views, rig)
+    start = _elsewhere(photo, rig)
+    if start is not None:
+        there = [_view(photo, _posed(rig, start), pixels) for pixels, *_ in SQUARE_FIT.passes]
+        for reach in SQUARE_FIT.far_reaches:
+            border = _border(there, rig, start, reach)
+            if border is not None:
+                return border
+        ends = _ends(there[0], _posed(rig, start))
+        if _inside(there[0], ends):  # some sides may be hardly another tone than the table
+            near = SQUARE_FIT.passes[0][0] * SQUARE_FIT.far_reaches[0]
+            if _outermost(there[0], ends, near)[2].sum() >= 2:
+                return start
+    border = _border(views, rig, np.zeros(6), SQUARE_FIT.passes[0][1])
     if border is not None:
         # Bricks have borders of their own, a little inside.
         clearer = np.log(_sides(views[-1], _posed(rig, border)).on / nominal.on).sum()
@@ -92,11 +106,81 @@ def _find(photo: Photo, rig: Rig) -> Array | None:
     return pose
 
 
-def _border(views: list[View], rig: Rig) -> Array | None:
-    """The camera's pose from the outermost changes near the nominal square, where the table beside
-    it is plain; None where these are no square."""
-    pose, seen = np.zeros(6), np.zeros(4, bool)
-    for view, (pixels, reach, *_) in zip(views, SQUARE_FIT.passes, strict=True):
+def _elsewhere(photo: Photo, rig: Rig) -> Array | None:
+    """A pose near that whose square is clear in the photo, far from the rig's own; None where there
+    is none."""
+    at = corners(photo, rig)
+    side = float(np.linalg.norm(at[1] - at[0]))
+    reach = np.abs(at - at.mean(0)).max() + SQUARE_FIT.far * side
+    view = view_around(photo, at.mean(0), reach, side / SQUARE_FIT.far_pixels)
+    square = _clearest(view, _ends(view, rig))
+    if square is None:
+        return None
+    moved = np.linalg.norm((square - _ends(view, rig)).mean((0, 1)))
+    if moved < SQUARE_FIT.far_off * SQUARE_FIT.far_pixels:
+        return None
+    pose, deviation = np.zeros(6), np.full(8, SQUARE_FIT.far_deviation)
+    for _ in range(2):
+        ends = _ends(view, _posed(rig, pose))
+        off = ((square - ends) * _normals(ends)[:, None]).sum(-1)
+        wanted = np.stack([off.mean(1), off[:, 1] - off[:, 0]], -1).ravel()
+        pose = pose + _solve(_slopes(view, rig, pose), pose, wanted, deviation)
+    return pose if pose @ pose <= SQUARE_FIT.greatest_pose * SQUARE_FIT.surely else None
+
+
+def _clearest(view: View, ends: Array) -> Array | None:
+    """The clearest square like that whose sides end at ``ends`` (4, 2, 2), scaled, turned and
+    anywhere in the view; None where none is clear.
+
+    It is as clear as the share of a side's points where the photo changes exceeds that of the
+    points beside it, outside, and on its line beyond the corners; the mean over the sides.
+    """
+    slopes = [
+        ndimage.gaussian_gradient_magnitude(tone, SQUARE_FIT.far_blur)
+        for tone in np.moveaxis(view.tone, -1, 0)
+    ]
+    slope = np.linalg.norm(slopes, axis=0)
+    times, least = SQUARE_FIT.far_change
+    changes = (slope > times * np.median(slope) + least).astype(np.float32)
+    near = ndimage.maximum_filter(changes, 3)
+    squares, clear = [], []
+    for scale, degrees in product(SQUARE_FIT.far_scales, SQUARE_FIT.far_turns):
+        turn = Rotation.from_euler("z", degrees, degrees=True).as_matrix()[:2, :2]
+        moved = (ends - ends.mean((0, 1))) @ turn.T * scale
+        shares = np.zeros(changes.shape)
+        for (a, b), outwards in zip(moved, _normals(moved), strict=True):
+            lines = [(a + d * outwards, b + d * outwards) for d in SQUARE_FIT.far_beside]
+            first, last = (d * (b - a) for d in SQUARE_FIT.far_beyond)
+            lines += [(b + first, b + last), (a - first, a - last)]
+            none = np.max([_share(changes, *line) for line in lines], 0)
+            shares += np.maximum(_share(near, a, b) - none, 0) / 4
+        squares.append(moved)
+        clear.append(shares)
+    best = np.max(clear)
+    if best < SQUARE_FIT.far_clear:
+        return None
+    # Squares of other sizes and turns, and some pixels off, are as clear: their mean.
+    alike, *rows = np.nonzero(np.array(clear) > best - SQUARE_FIT.far_alike)
+    place = np.stack(rows[::-1], -1) + 0.5
+    first = np.unravel_index(np.argmax(clear), np.shape(clear))[:0:-1]
+    own = np.linalg.norm(place - first, axis=-1) < SQUARE_FIT.far_near
+    return np.asarray(np.mean(np.array(squares)[alike[own]] + place[own][:, None, None], 0))
+
+
+def _share(changes: Array, a: Array, b: Array) -> Array:
+    """The share (H, W) of the points between a and b (2,), from each pixel, that are changes."""
+    points = np.rint(np.linspace(a, b, SQUARE_FIT.far_pixels)).astype(int)
+    r = int(np.abs(points).max())
+    kernel = np.zeros((2 * r + 1, 2 * r + 1), np.float32)
+    np.add.at(kernel, (r - points[:, 1], r - points[:, 0]), 1 / len(points))
+    return np.asarray(fftconvolve(np.pad(changes, r), kernel, "valid"))
+
+
+def _border(views: list[View], rig: Rig, pose: Array, reach: float) -> Array | None:
+    """The camera's pose from the outermost changes within ``reach`` sides of a pose's square, where
+    the table beside it is plain; None where these are no square."""
+    seen = np.zeros(4, bool)
+    for view, (pixels, *_) in zip(views, SQUARE_FIT.passes, strict=True):
         near = pixels * reach if view is views[0] else None
         for _ in range(2):
             ends = _ends(view, _posed(rig, pose))
@@ -116,10 +200,9 @@ def _border(views: list[View], rig: Rig) -> Array | None:
             if misfit > SQUARE_FIT.greatest_misfit:
                 return None
             pose = pose + move
-    if pose @ pose > SQUARE_FIT.greatest_pose:
-        return None
-    clear = seen.all() or _sides(views[-1], _posed(rig, pose)).clear()
-    return pose if clear else None
+    clear = _sides(views[-1], _posed(rig, pose)).clear()
+    most = SQUARE_FIT.greatest_pose * (SQUARE_FIT.surely if clear and seen.all() else 1)
+    return pose if (clear or seen.all()) and pose @ pose <= most else None
 
 
 def _in_photo(photo: Photo, at: Array) -> bool:

@@ -27,7 +27,7 @@ from invrender.capture.robust import spread as robust_spread
 from invrender.capture.settings import DISPLAY, JPEG_GAMMA, JPEG_LUMA, SCREEN_FIT
 from invrender.files.images import Photo
 from invrender.files.tone_curves import KNOTS
-from invrender.lights import GAMMAS, IDEAL, Device
+from invrender.lights import GAMMAS, IDEAL, STEEPEST_FALLOFF, Device
 from invrender.rig import Rig
 from invrender.sampling import resize_pattern
 from invrender.types import TINY, Array, InputError
@@ -377,7 +377,8 @@ class _Fit:
         """The display that ``u`` describes."""
         gamma = tuple(np.clip(np.exp(u[_GAMMA]), *GAMMAS).tolist())
         red, green, blue = ((r, g, b) for r, g, b in self.mixing(u).tolist())
-        return Device(float(u[_FALLOFF]), gamma, float(u[_BLACK]), (red, green, blue))
+        falloff = float(np.clip(u[_FALLOFF], 0, STEEPEST_FALLOFF))
+        return Device(falloff, gamma, float(u[_BLACK]), (red, green, blue))
 
     def blur(self, out: Array, u: Array, slope: bool) -> Array:
         """Images (n, H, W, C) blurred as the camera does; last, if asked for, the slope by that."""

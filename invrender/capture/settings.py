@@ -183,8 +183,27 @@ class SquareFit:
         (512, 0.02, 2, 0.015, 0.5, 0.8, 1.2),
     )  # by hand
     view_margin: float = 1.5  # of the first pass's reach; by hand
+    # A square farther away than that. Sides within which its middle may lie, and from which it is
+    # far; pixels of a side; sizes and turns (degrees) that are tried; by hand.
+    far: float = 0.5
+    far_off: float = 0.05
+    far_pixels: int = 48
+    far_scales: tuple[float, ...] = (0.95, 1.0, 1.05)
+    far_turns: tuple[float, ...] = (-2.5, 0.0, 2.5)
+    # Pixels, of the slopes of the tone; how many times their median, and by how much, a change is
+    # larger; pixels outside a side that should have none; how clear the square must be; by hand.
+    far_blur: float = 1.0
+    far_change: tuple[float, float] = (3.0, 0.02)
+    far_beside: tuple[float, ...] = (4.0, 6.0)
+    far_beyond: tuple[float, float] = (0.1, 0.35)  # sides, from a corner: no change either
+    far_clear: float = 0.5
+    far_alike: float = 0.06  # less clear are squares that count as well; by hand
+    far_near: float = 5.0  # pixels, from the clearest, of these; by hand
+    far_reaches: tuple[float, ...] = (0.06, 0.15)  # sides, of the border's search; by hand
+    far_deviation: float = 0.3  # pixels, of its sides; by hand
     greatest_misfit: float = 25.0  # squared deviations of the lines; two are left over; by hand
-    greatest_pose: float = 14.0  # squared deviations of the pose, six numbers; by hand
+    greatest_pose: float = 18.0  # squared deviations of the pose, six numbers; by hand
+    surely: float = 2.5  # times that, where all four sides are clear lines; by hand
     # Of three sides, the changes on the line must exceed by `clear` the greatest tenth of those
     # beside it, and `most` of the points change most there; or the whole side's by `whole`.
     clear: float = 2.0  # ratio; by hand

@@ -78,6 +78,32 @@ def test_a_sample_with_lines_of_its_own_does_not_mislead(table, seed):
     assert (found is RIG and table is textured_table) or off(photo, found, rig) < 0.005
 
 
+@pytest.mark.parametrize("sample", [marble, weave])
+@pytest.mark.parametrize("tilt", [(2.0, -1.2, 1.5), (-2.0, -1.5, -1.0), (-1.0, 2.0, 2.0)])
+def test_a_square_far_from_its_place_is_found(sample, tilt):
+    """An eighth of its side off, since the camera stands high; a shadow crosses the table."""
+    high = replace(RIG, camera_height=0.3, fov=50.0)
+    rig = replace(high, camera_shift=np.copysign((0.004, 0.004, 0.003), tilt), camera_tilt=tilt)
+
+    def table(point):
+        return grey_table(point) * np.where(point[..., 1:2] > 0.09, 0.5, 1.0)
+
+    photo = snap(rig, sample, table, noise=0.01)
+    assert off(photo, high, rig) > 0.12
+    assert off(photo, find_camera(photo, high)[0], rig) < 0.005
+
+
+@pytest.mark.parametrize("period", [0.06, 0.09])
+def test_tiles_without_end_are_no_square(period):
+    """Joints around tiles of the sample's size or a part of it, nothing else."""
+
+    def tiles(point):
+        joint = (np.mod(point[..., :2] + 0.011, period) < 0.003).any(-1, keepdims=True)
+        return np.where(joint, 0.15, 0.5) + [0.0] * 3
+
+    assert find_camera(snap(held(4), None, tiles, noise=0.01), RIG)[0] is RIG
+
+
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_displays_edge_beside_the_sample_is_not_its_border(seed):
     rig = held(seed)
