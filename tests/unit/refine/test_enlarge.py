@@ -3,9 +3,14 @@
 import numpy as np
 import pytest
 
+from invrender.capture.lights import find_lights
+from invrender.capture.sample import Sample
+from invrender.data import EXAMPLE
+from invrender.files.capture import load_capture
 from invrender.lights import Lights
 from invrender.maps import Maps, constant_maps, resize_maps
 from invrender.pattern.default import default_pattern
+from invrender.pipeline import Stages, estimate_maps
 from invrender.refine import enlarge as module
 from invrender.refine.enlarge import TAKEN, enlarge, explain_details
 from invrender.render.fast.estimator import Fast
@@ -13,6 +18,22 @@ from invrender.rig import Rig
 from invrender.sampling import resize
 
 SIZE, SMALL = 96, 24
+
+
+def test_two_large_photos_are_solved_small(monkeypatch):
+    """The maps have the photos' size; shrunk, they are those of the photos shrunk."""
+    pytest.importorskip("torch")
+    monkeypatch.setattr(module, "WHOLE", 24)
+    large = Sample.of(find_lights(load_capture(EXAMPLE)), 48)
+    start, result, photos = estimate_maps([large, large], Stages())
+    small = estimate_maps([large.shrunk(24, 24)] * 2, Stages())[1]
+    assert start.shape == (24, 24) and result.maps.shape == (48, 48) and len(photos) == 2
+    assert result.rendering is not None and result.rendering.shape == (48, 48, 3)
+    np.testing.assert_allclose(
+        result.maps.roughness, resize(small.maps.roughness, 48, 48), atol=1e-5
+    )
+    again = resize(result.maps.diffuse, 24, 24)
+    assert np.abs(again - small.maps.diffuse).mean() < 0.01
 
 
 @pytest.fixture
