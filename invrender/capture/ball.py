@@ -48,6 +48,7 @@ def find_ball(
     rig: Rig,
     manual: tuple[float, float, float] | None = None,
     tilt_deviation: float = RIM_FIT.tilt_deviation,
+    least: float = BALL_SEARCH.least_confidence,
 ) -> Ball:
     """Find the mirror ball in a photo; the rig gives its shape, its size and about its place.
 
@@ -57,7 +58,8 @@ def find_ball(
     measured, from the table seen in the ball against the same table seen directly, and the rig's is
     used only where the photo agrees with it. ``manual`` (x, y, r) in pixels overrides the search.
     ``tilt_deviation``: the expected error of the camera's tilt, degrees. Raises `InputError` where
-    no ball is found with enough confidence, or where it is cut off, saturated or too small.
+    no ball is found with at least the confidence ``least``, or where it is cut off, saturated or
+    too small.
     """
     size = (photo.height, photo.width)
     if manual is not None:
@@ -101,15 +103,21 @@ def find_ball(
     if tilt_deviation > RIM_FIT.tilt_deviation:
         ball = replace(ball, confidence=min(ball.confidence, BALL_SEARCH.tilted_confidence))
     (x, y), r = ball.centre, ball.radius
-    if ball.confidence < BALL_SEARCH.least_confidence:
-        raise InputError(
-            f"no mirror ball found (the best place, {x:.0f}, {y:.0f} with a radius of {r:.0f} "
-            f"pixels, has a confidence of {ball.confidence:.2f}): give it by hand as x, y, radius"
-        )
+    if ball.confidence < least:
+        raise no_ball(ball)
     if not is_whole(size, x, y, r):
         raise InputError(f"the mirror ball at {x:.0f}, {y:.0f} is cut off by the edge of the photo")
     _check_exposure(photo, ball)
     return measure_reflectance(photo, rig, ball)
+
+
+def no_ball(ball: Ball) -> InputError:
+    """The error for a photo in which the best place for a ball is none."""
+    (x, y), r = ball.centre, ball.radius
+    return InputError(
+        f"no mirror ball found (the best place, {x:.0f}, {y:.0f} with a radius of {r:.0f} "
+        f"pixels, has a confidence of {ball.confidence:.2f}): give it by hand as x, y, radius"
+    )
 
 
 def find_fov(photo: Photo, rig: Rig, manual: tuple[float, float, float] | None = None) -> float:

@@ -14,11 +14,11 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from invrender.capture.ball import find_ball
+from invrender.capture.ball import find_ball, no_ball
 from invrender.capture.ball_image import unfold_pattern
 from invrender.capture.camera import find_camera, is_whole
 from invrender.capture.mirror import Ball, make_ball, place_ball
-from invrender.capture.settings import BALL_SHAPE, CROPPING, ORIENTATION, SQUARE_FIT
+from invrender.capture.settings import BALL_SEARCH, BALL_SHAPE, CROPPING, ORIENTATION, SQUARE_FIT
 from invrender.files.capture import Capture
 from invrender.files.images import Photo
 from invrender.rig import BALL_SHAPES, Rig, fov_of
@@ -50,7 +50,7 @@ def find_ball_and_orientation(
         nominal = replace(capture, photo=turned_photo(photo, first))
         here, tilt_deviation = posed(nominal)
         try:
-            here, ball = find_either_ball(here, manual, tilt_deviation)
+            here, ball = find_either_ball(here, manual, tilt_deviation, BALL_SEARCH.doubtful)
             if tilt_deviation < SQUARE_FIT.unseen_tilt:  # the square shows the tilt better
                 ball = replace(ball, camera_tilt=None, tilt_deviation=None)
         except InputError as error:
@@ -60,6 +60,9 @@ def find_ball_and_orientation(
             _check_uncropped(here, ball)
         seen, white = unfold_pattern(here.photo, here.rig, ball, ORIENTATION.cells), white_of(here)
         expected = likeness(seen, resize_pattern(here.pattern, ORIENTATION.cells), white)
+        if manual is None and is_unlikely(ball, expected):
+            problem = problem or no_ball(ball)
+            continue
         tells = (seen < ORIENTATION.saturated * white).any(-1).mean() > ORIENTATION.telling
         # No orientation can be so much more alike, or the screen is white in all of them.
         if expected > 1 - ORIENTATION.better or not tells:
@@ -151,14 +154,23 @@ def not_the_pattern(ball: Ball) -> InputError:
     )
 
 
+def is_unlikely(ball: Ball, alike: float) -> bool:
+    """Whether a ball that is alike to the pattern by so much is none: its rim is not all that tells
+    it."""
+    return ball.confidence < BALL_SEARCH.least_confidence and alike < ORIENTATION.alike
+
+
 def find_either_ball(
-    capture: Capture, manual: Circle | None, tilt_deviation: float
+    capture: Capture,
+    manual: Circle | None,
+    tilt_deviation: float,
+    least: float = BALL_SEARCH.least_confidence,
 ) -> tuple[Capture, Ball]:
     """The ball, a hemisphere or a sphere, whichever fits better where nobody states it; and the
-    capture with that shape."""
+    capture with that shape. least: of `find_ball`."""
     photo, rig = capture.photo, capture.rig
     if "ball_shape" not in capture.unknown or manual is not None:
-        return capture, find_ball(photo, rig, manual, tilt_deviation)
+        return capture, find_ball(photo, rig, manual, tilt_deviation, least)
     found: list[tuple[float, Rig, Ball]] = []
     problem: InputError | None = None
     # The capture sheet measures the ball: taken for the other shape it is some 6% off.
@@ -166,7 +178,7 @@ def find_either_ball(
     for shape in BALL_SHAPES:
         shaped = replace(rig, ball_shape=shape)
         try:
-            ball = find_ball(photo, shaped, None, tilt_deviation)
+            ball = find_ball(photo, shaped, None, tilt_deviation, least)
         except InputError as error:
             problem = problem or error
             continue

@@ -54,6 +54,7 @@ class BallSearch:
     fit_radius: float = 64.0  # pixels of the ball in the rim fit's view; by hand
     fit_reach: float = 3.3  # radii of the rim fit's view; by hand
     least_confidence: float = 0.5  # below it there is no ball; by hand
+    doubtful: float = 0.4  # the same, where the ball shows the pattern; by hand
     certain: float = 0.7  # confidence from which no other place is tried; by hand
     likely: float = 0.65  # the same, where two fits agree; by hand
     same: float = 0.003  # radii between two fits that agree; by hand

@@ -7,8 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from invrender.capture.orientation import find_either_ball, likeness, posed, seen_patterns, white_of
-from invrender.capture.settings import ORIENTATION, WHICH_PATTERN
+from invrender.capture.ball import no_ball
+from invrender.capture.orientation import (
+    find_either_ball,
+    is_unlikely,
+    likeness,
+    posed,
+    seen_patterns,
+    white_of,
+)
+from invrender.capture.settings import BALL_SEARCH, ORIENTATION, WHICH_PATTERN
 from invrender.files.capture import Capture
 from invrender.sampling import resize_pattern
 from invrender.types import Array, InputError
@@ -22,7 +30,7 @@ def find_pattern(capture: Capture, patterns: Sequence[Array]) -> tuple[Capture, 
     two as well as each other.
     """
     here, tilt_deviation = posed(capture)
-    here, ball = find_either_ball(here, None, tilt_deviation)
+    here, ball = find_either_ball(here, None, tilt_deviation, BALL_SEARCH.doubtful)
     small = [resize_pattern(p, ORIENTATION.cells) for p in patterns]
     white = white_of(here)
     scores = np.full((4, len(small)), -1.0)
@@ -30,6 +38,8 @@ def find_pattern(capture: Capture, patterns: Sequence[Array]) -> tuple[Capture, 
         scores[turn] = [likeness(seen, pattern, white) for pattern in small]
     turn, which = (int(i) for i in np.unravel_index(np.argmax(scores), scores.shape))
     best = scores.max(0)
+    if is_unlikely(ball, best[which]):
+        raise no_ball(ball)
     (x, y), r = ball.centre, ball.radius
     if best[which] < WHICH_PATTERN.alike:
         raise InputError(

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from synthetic_photo import grey_table, photograph, sky
 
+from invrender.capture.orientation import find_ball_and_orientation
+from invrender.capture.settings import BALL_SEARCH
 from invrender.capture.which_pattern import find_pattern
 from invrender.cli.main import main
 from invrender.files.capture import Capture
@@ -37,10 +39,20 @@ def test_each_is_recognised(which):
     assert found.pattern is SET[which]
 
 
+OTHER = np.random.default_rng(0).uniform(0.02, 1, (4, 4, 3)).repeat(16, 0).repeat(16, 1)
+
+
 def test_another_pattern_is_refused():
-    other = np.random.default_rng(0).uniform(0.02, 1, (4, 4, 3)).repeat(16, 0).repeat(16, 1)
     with pytest.raises(InputError, match="none of the set"):
-        find_pattern(capture_of(other), SET)
+        find_pattern(capture_of(OTHER), SET)
+
+
+def test_a_doubtful_ball_is_one_if_it_shows_a_pattern(monkeypatch):
+    doubt = replace(BALL_SEARCH, least_confidence=1.0)
+    monkeypatch.setattr("invrender.capture.orientation.BALL_SEARCH", doubt)
+    assert find_ball_and_orientation(capture_of(SET[0]))[1].confidence < 1
+    with pytest.raises(InputError, match="no mirror ball found"):
+        find_pattern(capture_of(OTHER), SET)
 
 
 def test_the_same_pattern_twice_in_a_set_is_refused():
