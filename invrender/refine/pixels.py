@@ -42,7 +42,6 @@ class Settings:
     roughness: float = 0.25
     slope: float = 0.6  # at most, of what the photos show of the relief
     least_slope: float = 0.05
-    tails: float = 2.0  # times their spread that slopes are expected to have: most pixels are flat
     metal_diffuse: float = 0.01  # and of a metal
     metal_f0: float = 0.3
     f0_range: tuple[float, float] = (0.08, 0.2)  # surely dielectric; surely metal
@@ -64,7 +63,6 @@ class Settings:
     # rest. A third time changes maps by 0.5%.
     spread: tuple[float, ...] = (1.0, 0.25)
     least_roughness: float = 0.015  # that deviation, at least
-    expected_slopes: float = 2.0  # times what is expected of the initial slopes' errors
     few: int = 3  # steps where a smaller size was solved before
     stop: float = 0.003  # relative decrease of the cost below which steps end
     trust: tuple[float, float, float] = (0.3, 0.15, 0.3)  # most that a step moves k, ρ, slopes

@@ -233,7 +233,7 @@ def _relief(
     square = (point.theta[..., N] - problem.mean[..., N]) ** 2
     weight = 1 / (variance + s.least_slope**2)
     excess = float((weight * (square - variance)).sum() / weight.sum())
-    return float(np.clip(s.tails * np.sqrt(max(excess, 0)), s.least_slope, s.slope))
+    return float(np.clip(np.sqrt(max(excess, 0)), s.least_slope, s.slope))
 
 
 def _solve_all(
@@ -296,7 +296,7 @@ def _weighed(
     excess = np.maximum(misfit * trust, 1.0)[..., None]
     wide, slopes = problem.prior_precision(), np.arange(9)[N]
     known = np.zeros_like(wide)
-    known[..., slopes, slopes] = 1 / (s.expected_slopes * expected[..., N]) ** 2
+    known[..., slopes, slopes] = 1 / expected[..., N] ** 2
     drawn = np.einsum("hwpq,hwq->hwp", wide, point.theta - problem.mean)
     data = (point.hessian - wide) / excess[..., None]
     pull = (point.gradient + drawn) / excess - drawn
