@@ -628,6 +628,8 @@ def light_on_paper(found: FoundSheet, lights: Lights, doubt: float = math.inf) -
         bright = screen * np.exp(x[:3]) + room * np.exp(x[3]) + lamps * np.exp(x[4:7])
         lens = lens_gain(min(x[8], SHEET_FIT.most_vignetting), found.white_aside)
         off = (bright * np.exp(x[7]) / lens[:, None] - seen) * weight
+        # Its square is soft_l1's loss: paper in a shadow may be far off, what is known may not.
+        off *= np.sqrt(2 / (1 + np.sqrt(1 + off**2)))
         prior = (
             x[:3].mean() / doubt,
             *((x[:3] - x[:3].mean()) / channels),
@@ -639,7 +641,7 @@ def light_on_paper(found: FoundSheet, lights: Lights, doubt: float = math.inf) -
         )
         return np.append(off.ravel(), prior)
 
-    done = least_squares(errors, np.zeros(9), loss="soft_l1")
+    done = least_squares(errors, np.zeros(9))
     covariance = np.linalg.pinv(done.jac.T @ done.jac)
     factors = np.exp(done.x)
     return PaperLight(
@@ -680,8 +682,9 @@ def use_paper(
     saturated = fit.get("saturated", 0) > SCREEN_FIT.saturated
     both = light_on_paper(sheet, lights, doubt) if agree and doubt > 0 else free
     assert both is not None
-    by_paper = saturated and both.deviation < SHEET_FIT.useful
-    if by_paper or (agree and doubt > 0):
+    # Where the two contradict each other, the surer one is taken.
+    by_paper = saturated and both.deviation < (SHEET_FIT.useful if agree else doubt)
+    if by_paper or (agree and both.deviation < doubt):
         lights = _with_light(lights, both)
         fit["gain_deviation"] = both.deviation
         fit["room_raised"] = fit.get("room_raised", 1.0) * float(both.lamps.mean())

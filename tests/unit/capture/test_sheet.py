@@ -261,7 +261,8 @@ def test_saturated_paper_does_not_count(image):
 def test_the_paper_stands_in_for_a_saturated_ball_and_contradicts_a_wrong_one(image):
     used, found, _ = use_sheet(captured(image))
     ball = make_ball(used.rig, used.rig.ball_centre, RIG.ball_radius, image.shape[:2])
-    dim = Lights(used.rig, default_pattern(64), gain=0.5 * np.array(GAIN), fit={"saturated": 0.3})
+    fit = {"saturated": 0.3, "gain_deviation": 0.4}
+    dim = Lights(used.rig, default_pattern(64), gain=0.5 * np.array(GAIN), fit=fit)
     lights, notices = use_paper(found, dim, ball)
     assert lights.gain == pytest.approx(GAIN, rel=0.05)
     assert [n.code for n in notices] == ["gain-by-paper"]
@@ -270,6 +271,18 @@ def test_the_paper_stands_in_for_a_saturated_ball_and_contradicts_a_wrong_one(im
     assert [n.code for n in notices] == ["sheet-scale", "paper-contradicts-ball"]
     assert "94%" in notices[0].text
     assert use_paper(None, dim, ball) == (dim, ())
+
+
+def test_paper_in_a_shadow_does_not_overrule_a_ball_that_is_surer(image):
+    """Two thirds of the paper lie in a shadow that no light explains, in another colour."""
+    x = np.arange(image.shape[1])[None, :, None] / image.shape[1]
+    used, found, _ = use_sheet(captured(image * np.where(x < 0.67, (0.5, 0.2, 0.2), 1.0)))
+    ball = make_ball(used.rig, used.rig.ball_centre, RIG.ball_radius, image.shape[:2])
+    fit = {"saturated": 0.15, "gain_deviation": 0.05}
+    lights = Lights(used.rig, default_pattern(64), gain=np.array(GAIN), fit=fit)
+    after, notices = use_paper(found, lights, ball)
+    assert np.abs(np.log(after.gain / GAIN)).max() < 0.15
+    assert "gain-by-paper" not in [n.code for n in notices]
 
 
 def test_the_paper_tells_how_bright_guessed_lamps_are():
