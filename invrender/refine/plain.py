@@ -7,7 +7,6 @@
   of the photo, or its light. Details that go with the albedo's are the texture's own and stay.
   There is no texture where neighbouring pixels hardly vary together: then the albedo's variation is
   noise too, and none is kept.
-
 - **Relief.** A network's slopes are wrinkles of its own where all of them are shallow; else it sees
   their wide shades too steep, which the light's resemble, and the details too shallow.
 
