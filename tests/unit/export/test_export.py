@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import xml.etree.ElementTree as ET
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import OpenEXR
@@ -296,12 +297,9 @@ def test_command(maps, tmp_path, capsys):
 
 def test_glb_passes_khronos_validator(maps, tmp_path):
     node = shutil.which("node")
-    if node is None:
-        pytest.skip("Khronos' validator needs node")
-    package = tmp_path / "npm"
-    command = ["npm", "install", "--silent", "--prefix", package, "gltf-validator@2.0.0-dev.3.10"]
-    if subprocess.run(command, capture_output=True, timeout=120).returncode:
-        pytest.skip("npm cannot fetch Khronos' validator")
+    root = Path(__file__).parents[3]
+    if node is None or not (root / "node_modules/gltf-validator").is_dir():
+        pytest.skip("no Khronos validator (node; npm install gltf-validator@2.0.0-dev.3.10)")
     script = (
         "require('gltf-validator').validateBytes(require('fs').readFileSync(process.argv[1]))"
         ".then(report => console.log(JSON.stringify(report.issues)))"
@@ -309,7 +307,7 @@ def test_glb_passes_khronos_validator(maps, tmp_path):
     for format in TARGETS["gltf"].formats:
         export_maps(maps, tmp_path / "m.glb", "gltf", format=format)
         done = subprocess.run(
-            [node, "-e", script, tmp_path / "m.glb"], cwd=package, capture_output=True, text=True
+            [node, "-e", script, tmp_path / "m.glb"], cwd=root, capture_output=True, text=True
         )
         assert json.loads(done.stdout)["messages"] == []
 
