@@ -47,7 +47,7 @@ BAND_PIXELS = 1 << 16  # pixels at once
 
 
 def fitting(photo: Array, longest: int) -> tuple[int, int]:
-    """Height and width of the photo (H, W, 3) shrunk until the longer of them is ``longest``."""
+    """Height and width of a photo or maps (H, W, n) shrunk until the longer is ``longest``."""
     height, width = photo.shape[:2]
     scale = longest / max(height, width)
     return max(1, round(height * scale)), max(1, round(width * scale))

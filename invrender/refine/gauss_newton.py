@@ -65,8 +65,8 @@ class Observation:
 
 @dataclass(frozen=True)
 class Camera:
-    """What is left of a camera in a photo: ``loss`` times what is `Observation.away` was taken of
-    the light's logarithm, and the light raised to a power 1 + ``exponent`` about ``middle``."""
+    """What is left of a camera in a photo: the light's logarithm lacks ``loss`` times
+    `Observation.away`, and the light is raised to a power 1 + ``exponent`` about ``middle``."""
 
     exponent: float
     loss: float

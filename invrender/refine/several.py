@@ -27,6 +27,7 @@ import numpy as np
 from scipy import ndimage
 
 from invrender.refine.flat import flat_maps
+from invrender.refine.enlarge import fitting
 from invrender.refine.gauss_newton import BAND, Observation, Refined, linearise
 from invrender.refine.pixels import (
     TOGETHER,
@@ -128,8 +129,7 @@ def _explain_all(
     """From initial maps θ and their expected errors. A large image starts from itself shrunk."""
     height, width = theta.shape[:2]
     if max(height, width) > s.whole:
-        scale = s.whole / max(height, width)
-        low = max(1, round(height * scale)), max(1, round(width * scale))
+        low = fitting(theta, s.whole)
         coarse = project(resize(theta, *low))
         few = [p.shrunk(*low) for p in photos]
         found = _explain_all(few, coarse, resize(sigma, *low), samples, progress, s)
