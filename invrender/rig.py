@@ -206,9 +206,7 @@ class Rig:
         if not self.has_screen:
             return np.zeros((*np.shape(points)[:-1], cells, cells))
         e_x, e_y = self.screen_edges
-        t = (np.arange(cells) + 0.5) / cells
-        middle = self.screen_corner + t[:, None] * e_x + (1 - t)[:, None, None] * e_y
-        middle = middle.reshape(-1, 3)
+        middle = screen_middles(self, cells)
         down = np.cross(e_y, e_x) / cells**2  # as long as a cell's area
         p = np.asarray(points)
         square = (p * p).sum(-1)[..., None] + (middle * middle).sum(-1) - 2 * p @ middle.T
@@ -299,3 +297,12 @@ class Rig:
         )
         d = d @ self.camera_axes
         return d / np.linalg.norm(d, axis=-1, keepdims=True)
+
+
+def screen_middles(rig: Rig, cells: int) -> Array:
+    """The middles (cells², 3) of a screen's ``cells`` × ``cells`` parts, row 0 at the pattern's
+    top."""
+    e_x, e_y = rig.screen_edges
+    t = (np.arange(cells) + 0.5) / cells
+    middle = rig.screen_corner + t[:, None] * e_x + (1 - t)[:, None, None] * e_y
+    return np.asarray(middle.reshape(-1, 3))

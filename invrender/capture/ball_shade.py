@@ -15,14 +15,15 @@ from scipy import ndimage
 
 from invrender.capture.crop import crop_part
 from invrender.capture.mirror import Ball
-from invrender.capture.settings import BALL_SHADE
-from invrender.capture.table import hidden_by_screen
+from invrender.capture.near_lamp import Indices, connected
+from invrender.capture.settings import BALL_SHADE, TABLE_METER
+from invrender.capture.table import points_seen, seen_past_screen
 from invrender.files.images import Photo
 from invrender.lights import Lights
-from invrender.rig import Rig
+from invrender.rig import Rig, screen_middles
 from invrender.sampling import resize_pattern
 from invrender.sphere import resample_environment, sky_flux
-from invrender.types import TINY, Array
+from invrender.types import TINY, Array, Mask
 
 
 def without_ball_shade(photo: Photo, lights: Lights, ball: Ball) -> Photo:
@@ -30,75 +31,69 @@ def without_ball_shade(photo: Photo, lights: Lights, ball: Ball) -> Photo:
 
     photo: in the lights' unit.
     """
-    rig, side = lights.rig, BALL_SHADE.side
-    if _lost(lights, ball, BALL_SHADE.coarse, 1.0).max() < BALL_SHADE.least:
+    rig, side, few = lights.rig, BALL_SHADE.side, BALL_SHADE.coarse
+    d, flux = sky_flux(lights.environment)
+    lamp = flux.mean(-1) > BALL_SHADE.lamp * flux.mean(-1).sum()
+    texel = np.pi / len(lights.environment)
+    # Only the shadows of lamps are sharp.
+    points = rig.sample_points(few, few).reshape(-1, 3)
+    wide = _room_light(lights, ball, points, lamp) + _screen_light(lights, ball, points)
+    whole = wide + _light(rig, ball, points, d[lamp], flux[lamp], texel)
+    if _lost(whole).max() < BALL_SHADE.least:
         return photo
+    zoom = (1, side / few, side / few, 1)
+    wide = wide.reshape(2, few, few, 3)
+    wide = ndimage.zoom(wide, zoom, order=1, mode="nearest", grid_mode=True)
+    points = rig.sample_points(side, side).reshape(-1, 3)
     log = np.log(np.maximum(crop_part(photo, rig, side), TINY)).mean(-1)
+    lamps = connected(lamp.reshape(len(lights.environment) // 2, -1))
     best, least = None, BALL_SHADE.most_left
     for spread in BALL_SHADE.spreads:
-        shade = np.log(np.maximum(1 - _lost(lights, ball, side, spread), BALL_SHADE.darkest))
+        towards = _narrowed(d, flux.mean(-1), lamps, spread)[lamp]
+        sharp = _light(rig, ball, points, towards, flux[lamp], spread * texel)
+        shade = np.log(np.maximum(1 - _lost(wide + sharp.reshape(wide.shape)), BALL_SHADE.darkest))
         strength, left = _fit(log, shade.mean(-1))
         if BALL_SHADE.weakest < strength < BALL_SHADE.strongest and left < least:
             best, least = strength * shade, left
     return photo if best is None else _without(photo, rig, best)
 
 
-def _lost(lights: Lights, ball: Ball, side: int, spread: float) -> Array:
-    """The share of the sample's irradiance (side, side, 3) that the ball takes; of lamps, as wide
-    as the environment shows them times ``spread``."""
-    rig, h = lights.rig, len(lights.environment)
-    d, flux = sky_flux(lights.environment)
-    lamp = flux.mean(-1) > BALL_SHADE.lamp * flux.mean(-1).sum()
-    room = np.array(lights.environment)
-    room[: h // 2].reshape(-1, 3)[lamp] = 0
-    # Only the shadows of lamps are sharp.
-    few = BALL_SHADE.coarse
-    points = rig.sample_points(few, few).reshape(-1, 3)
-    rows = BALL_SHADE.environment_rows
-    parts = _light(rig, ball, points, *sky_flux(resample_environment(room, rows)), np.pi / rows)
-    parts += _screen_light(lights, ball, points)
-    zoom = (side / few, side / few, 1)
-    total, lost = (
-        ndimage.zoom(a.reshape(few, few, 3), zoom, order=1, mode="nearest", grid_mode=True)
-        for a in parts
-    )
-    if lamp.any():
-        towards = _narrowed(d, flux.mean(-1) * lamp, h // 2, spread)[lamp]
-        points = rig.sample_points(side, side).reshape(-1, 3)
-        more = _light(rig, ball, points, towards, flux[lamp], spread * np.pi / h)
-        total, lost = (
-            a + b.reshape(side, side, 3) for a, b in zip((total, lost), more, strict=True)
-        )
-    return np.asarray(lost / np.maximum(total, TINY))
+# Light below is (2, n, 3): the irradiance of points that face up, and the part that the ball takes.
+
+
+def _lost(light: Array) -> Array:
+    """The share that the ball takes."""
+    return np.asarray(light[1] / np.maximum(light[0], TINY))
 
 
 def _light(rig: Rig, ball: Ball, points: Array, d: Array, flux: Array, width: float) -> Array:
-    """(2, n, 3): what the points get from directions (m, 3) that send ``flux`` (m, 3) from spots
-    ``width`` radians wide, but for what the screen hides; and the part of it that the ball takes.
-    """
+    """From directions d (m, 3) that send ``flux`` (m, 3) from spots ``width`` radians wide, where
+    the screen does not hide them."""
     out = np.empty((2, len(points), 3))
-    step = max(1, BALL_SHADE.at_once // max(len(d), 1))
-    for i in range(0, len(points), step):
-        some = points[i : i + step]
-        seen = (~hidden_by_screen(rig, some, d)).astype(np.float32)
-        out[0, i : i + step] = seen @ flux
-        out[1, i : i + step] = (seen * _behind(ball, some, d, width)) @ flux
+    for band, seen in seen_past_screen(rig, points, d):
+        out[0, band] = seen @ flux
+        out[1, band] = (seen * _behind(ball, points[band], d, width)) @ flux
     return out
 
 
+def _room_light(lights: Lights, ball: Ball, points: Array, lamp: Mask) -> Array:
+    """From the room but for its lamps."""
+    room, rows = np.array(lights.environment), TABLE_METER.environment_rows
+    room[: len(room) // 2].reshape(-1, 3)[lamp] = 0
+    d, flux = sky_flux(resample_environment(room, rows))
+    return _light(lights.rig, ball, points, d, flux, np.pi / rows)
+
+
 def _screen_light(lights: Lights, ball: Ball, points: Array) -> Array:
-    """The same of the screen's light."""
-    rig, cells = lights.rig, BALL_SHADE.screen_cells
+    """From the screen."""
+    rig, cells = lights.rig, TABLE_METER.screen_cells
     if not rig.has_screen:
         return np.zeros((2, len(points), 3))
     light = resize_pattern(lights.shown, cells) * lights.gain
     cosines = rig.screen_cosines(points, cells, lights.device.falloff)
-    e_x, e_y = rig.screen_edges
-    t = (np.arange(cells) + 0.5) / cells
-    middle = rig.screen_corner + t[:, None] * e_x + (1 - t)[:, None, None] * e_y
-    way = middle.reshape(-1, 3) - points[:, None]
+    way = screen_middles(rig, cells) - points[:, None]
     distance = np.linalg.norm(way, axis=-1, keepdims=True)
-    width = np.linalg.norm(e_x) / cells / distance[..., 0]
+    width = rig.screen_sides[0] / cells / distance[..., 0]
     behind = _behind(ball, points, way / distance, width).reshape(cosines.shape)
     return np.einsum("anij,ijc->anc", np.stack([cosines, cosines * behind]), light)
 
@@ -113,12 +108,10 @@ def _behind(ball: Ball, points: Array, d: Array, width: float | Array) -> Array:
     return np.clip(inside / width + 0.5, 0, 1)
 
 
-def _narrowed(d: Array, flux: Array, rows: int, spread: float) -> Array:
+def _narrowed(d: Array, flux: Array, lamps: list[Indices], spread: float) -> Array:
     """Directions (m, 3) of the sky's texels, those of each lamp drawn towards its middle."""
     out = np.array(d)
-    label, count = ndimage.label(flux.reshape(rows, -1) > 0, np.ones((3, 3)))
-    for k in range(1, count + 1):
-        own = label.ravel() == k
+    for own in lamps:
         middle = flux[own] @ d[own] / flux[own].sum()
         out[own] = middle + spread * (d[own] - middle)
     return out / np.linalg.norm(out, axis=-1, keepdims=True)
@@ -148,9 +141,9 @@ def _without(photo: Photo, rig: Rig, shade: Array) -> Photo:
     x0, y0 = np.clip(np.floor(corners.min(0)).astype(int), 0, [w, h])
     x1, y1 = np.clip(np.ceil(corners.max(0)).astype(int), 0, [w, h])
     pixels = np.stack(np.meshgrid(np.arange(x0, x1) + 0.5, np.arange(y0, y1) + 0.5), -1)
-    ray = rig.rays(pixels, h, w)
-    at = (rig.camera - ray * (rig.camera[2] / ray[..., 2:]))[..., :2] / rig.sample_size
-    inside = (np.abs(at) < 0.5).all(-1)
+    points, down = points_seen(rig, pixels, h, w)
+    at = points[..., :2] / rig.sample_size
+    inside = down & (np.abs(at) < 0.5).all(-1)
     n = len(shade)
     place = np.stack([(0.5 - at[..., 1]) * n - 0.5, (at[..., 0] + 0.5) * n - 0.5])[:, inside]
     image = np.array(photo.image)

@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 from scipy import ndimage
-from scipy.signal import fftconvolve
 from scipy.spatial.transform import Rotation
 
 from invrender.capture.ball_image import sample_image
@@ -63,18 +62,9 @@ def _find(photo: Photo, rig: Rig) -> Array | None:
     pose: Array = np.zeros(6)
     if np.all(nominal.median > SQUARE_FIT.nominal) and nominal.clear():
         return pose  # all four: no need to look elsewhere
-    start = _elsewhere(photo, rig)
-    if start is not None:
-        there = [_view(photo, _posed(rig, start), pixels) for pixels, *_ in SQUARE_FIT.passes]
-        for reach in SQUARE_FIT.far_reaches:
-            border = _border(there, rig, start, reach)
-            if border is not None:
-                return border
-        ends = _ends(there[0], _posed(rig, start))
-        if _inside(there[0], ends):  # some sides may be hardly another tone than the table
-            near = SQUARE_FIT.passes[0][0] * SQUARE_FIT.far_reaches[0]
-            if _outermost(there[0], ends, near)[2].sum() >= 2:
-                return start
+    far = _elsewhere(photo, rig)
+    if far is not None:
+        return far
     border = _border(views, rig, np.zeros(6), SQUARE_FIT.passes[0][1])
     if border is not None:
         # Bricks have borders of their own, a little inside.
@@ -107,6 +97,24 @@ def _find(photo: Photo, rig: Rig) -> Array | None:
 
 
 def _elsewhere(photo: Photo, rig: Rig) -> Array | None:
+    """The camera's pose by a square far from the rig's own; None where none is clear."""
+    start = _far_start(photo, rig)
+    if start is None:
+        return None
+    views = [_view(photo, _posed(rig, start), pixels) for pixels, *_ in SQUARE_FIT.passes]
+    for reach in SQUARE_FIT.far_reaches:
+        border = _border(views, rig, start, reach)
+        if border is not None:
+            return border
+    # Some sides may be hardly another tone than the table.
+    ends = _ends(views[0], _posed(rig, start))
+    if not _inside(views[0], ends):
+        return None
+    near = SQUARE_FIT.passes[0][0] * SQUARE_FIT.far_reaches[0]
+    return start if _outermost(views[0], ends, near)[2].sum() >= 2 else None
+
+
+def _far_start(photo: Photo, rig: Rig) -> Array | None:
     """A pose near that whose square is clear in the photo, far from the rig's own; None where there
     is none."""
     at = corners(photo, rig)
@@ -121,9 +129,7 @@ def _elsewhere(photo: Photo, rig: Rig) -> Array | None:
         return None
     pose, deviation = np.zeros(6), np.full(8, SQUARE_FIT.far_deviation)
     for _ in range(2):
-        ends = _ends(view, _posed(rig, pose))
-        off = ((square - ends) * _normals(ends)[:, None]).sum(-1)
-        wanted = np.stack([off.mean(1), off[:, 1] - off[:, 0]], -1).ravel()
+        wanted = _moved(_ends(view, _posed(rig, pose)), square)
         pose = pose + _solve(_slopes(view, rig, pose), pose, wanted, deviation)
     return pose if pose @ pose <= SQUARE_FIT.greatest_pose * SQUARE_FIT.surely else None
 
@@ -170,10 +176,12 @@ def _clearest(view: View, ends: Array) -> Array | None:
 def _share(changes: Array, a: Array, b: Array) -> Array:
     """The share (H, W) of the points between a and b (2,), from each pixel, that are changes."""
     points = np.rint(np.linspace(a, b, SQUARE_FIT.far_pixels)).astype(int)
+    height, width = changes.shape
     r = int(np.abs(points).max())
-    kernel = np.zeros((2 * r + 1, 2 * r + 1), np.float32)
-    np.add.at(kernel, (r - points[:, 1], r - points[:, 0]), 1 / len(points))
-    return np.asarray(fftconvolve(np.pad(changes, r), kernel, "valid"))
+    around, count = np.pad(changes, r), np.zeros_like(changes)
+    for x, y in r + points:
+        count += around[y : y + height, x : x + width]
+    return count / len(points)
 
 
 def _border(views: list[View], rig: Rig, pose: Array, reach: float) -> Array | None:
@@ -266,17 +274,21 @@ def _improve(
 def _slopes(view: View, rig: Rig, pose: Array) -> Array:
     """By what a pose moves the sides' places and slopes, (8, 6)."""
     now = _ends(view, _posed(rig, pose))
-    normal = _normals(now)
 
     def lines(pose: Array) -> Array:
-        """How far each side's ends have moved across: the mean and the difference."""
-        off = ((_ends(view, _posed(rig, pose)) - now) * normal[:, None]).sum(-1)
-        return np.stack([off.mean(1), off[:, 1] - off[:, 0]], -1).ravel()
+        return _moved(now, _ends(view, _posed(rig, pose)))
 
     step = SQUARE_FIT.slope_step
     return np.stack(
         [(lines(pose + u) - lines(pose - u)) / (2 * step) for u in step * np.eye(6)], -1
     )
+
+
+def _moved(now: Array, then: Array) -> Array:
+    """How far sides (4, 2, 2) have moved across: the mean of each one's ends and the difference,
+    (8,)."""
+    off = ((then - now) * _normals(now)[:, None]).sum(-1)
+    return np.stack([off.mean(1), off[:, 1] - off[:, 0]], -1).ravel()
 
 
 def _solve(slopes: Array, pose: Array, wanted: Array, deviation: Array) -> Array:

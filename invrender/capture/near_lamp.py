@@ -8,6 +8,7 @@ say so, the lamp has a place.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from invrender.capture.mirror import Ball
@@ -20,6 +21,8 @@ from invrender.rig import Rig
 from invrender.sampling import parabola_top
 from invrender.sphere import sky_flux
 from invrender.types import TINY, Array, Mask
+
+Indices = NDArray[np.intp]
 
 
 def find_near_lamp(photo: Photo, rig: Rig, ball: Ball, environment: Array) -> NearLamp | None:
@@ -64,15 +67,10 @@ def brightest_lamp(environment: Array) -> Mask | None:
     d, flux = sky_flux(environment)
     d, flux = d.reshape(height // 2, width, 3), flux.mean(-1).reshape(height // 2, width)
     level = environment[: height // 2].mean(-1)
-    # Twice around, so that a lamp at the seam is one.
-    bright = np.tile(level > NEAR_LAMP.bright * np.median(level), 2)
-    label, count = ndimage.label(bright, np.ones((3, 3)))
     best, most = None, NEAR_LAMP.share * float(flux.sum())
-    for k, part in enumerate(ndimage.find_objects(label) if count else (), 1):
-        rows, columns = np.nonzero(label[part] == k)
-        rows, columns = rows + part[0].start, (columns + part[1].start) % width
+    for part in connected(level > NEAR_LAMP.bright * np.median(level)):
         own = np.zeros_like(flux, bool)
-        own[rows, columns] = True
+        own.flat[part] = True
         total = float(flux[own].sum())
         if total <= most:
             continue
@@ -84,3 +82,22 @@ def brightest_lamp(environment: Array) -> Mask | None:
     if best is None:
         return None
     return np.concatenate([best, np.zeros_like(best)])
+
+
+def connected(mask: Mask) -> list[Indices]:
+    """The parts of a mask (h, W) of an environment whose texels touch each other, also where it
+    begins and ends: flat indices, the largest part first."""
+    width = mask.shape[1]
+    label, count = ndimage.label(np.tile(mask, 2), np.ones((3, 3)))  # twice around
+    row, column = np.nonzero(label)
+    number, at = label[row, column], row * width + column % width
+    order = np.argsort(number, kind="stable")
+    ends = np.cumsum(np.bincount(number, minlength=count + 1)[1:])
+    parts = [np.unique(part) for part in np.split(at[order], ends[:-1])] if count else []
+    taken = np.zeros(mask.size, bool)
+    found: list[Indices] = []
+    for part in sorted(parts, key=len, reverse=True):
+        if not taken[part[0]]:  # else it is a copy, or what the end cuts off
+            taken[part] = True
+            found.append(part)
+    return found

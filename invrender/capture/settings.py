@@ -627,8 +627,6 @@ class BallShade:
 
     side: int = 128  # of the sample's square, where lamps throw it
     coarse: int = 16  # the same, for other light
-    environment_rows: int = 32  # of that
-    screen_cells: int = 16  # of the screen, a side
     lamp: float = 1e-3  # share of the room's light, from which a texel is a lamp's
     least: float = 0.03  # share of the light that a shadow takes somewhere
     darkest: float = 0.02  # share of the light that is left
@@ -639,7 +637,6 @@ class BallShade:
     weakest: float = 0.4  # of the shadow's strength, in the photo
     strongest: float = 1.6
     most_left: float = 0.9  # share of the photo's slopes, that is left
-    at_once: int = 2_000_000  # pairs of a point and a direction in memory
 
 
 DAMPED_STEPS = DampedSteps()

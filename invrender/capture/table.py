@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -60,9 +61,7 @@ def table_blocks(photo: Photo, rig: Rig, ball: Ball) -> tuple[Array, Array, Mask
     mean = cut(photo.image).mean((1, 3))
     block = k * step
     centre = np.stack(np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5), -1) * block
-    ray = rig.rays(centre, photo.height, photo.width)
-    down = ray[..., 2] < -TABLE_METER.downward
-    points = rig.camera - ray * (rig.camera[2] / np.where(down, ray[..., 2], -1))[..., None]
+    points, down = points_seen(rig, centre, photo.height, photo.width)
     block = block / rig.focal(photo.width) * rig.camera[2]
     margin = TABLE_METER.sample_margin * block
     sample = (np.abs(points[..., :2]) < rig.sample_size / 2 + margin).all(-1)
@@ -70,6 +69,14 @@ def table_blocks(photo: Photo, rig: Rig, ball: Ball) -> tuple[Array, Array, Mask
     use = down & ~sample & (distance > TABLE_METER.ball_margin * ball.radius_m + block)
     use &= ~cut(photo.clipped).any((1, 3)) & (mean.min(-1) > 0)
     return mean, points, use
+
+
+def points_seen(rig: Rig, pixels: Array, height: int, width: int) -> tuple[Array, Mask]:
+    """The table's points (..., 3) that pixels (..., 2) of a photo of that size see, and which of
+    them look down at it."""
+    ray = rig.rays(pixels, height, width)
+    down = ray[..., 2] < -TABLE_METER.downward
+    return rig.camera - ray * (rig.camera[2] / np.where(down, ray[..., 2], -1))[..., None], down
 
 
 def distant_pairs(use: Mask) -> list[tuple[tuple[Any, Any], int]]:
@@ -111,7 +118,14 @@ def room_irradiance(rig: Rig, points: Array, environment: Array) -> Array:
     d, flux = sky_flux(environment)
     lit = np.flatnonzero(flux.any(-1))
     out = np.empty((len(points), 3))
-    step = max(1, TABLE_METER.at_once // max(len(lit), 1))
-    for i in range(0, len(points), step):
-        out[i : i + step] = ~hidden_by_screen(rig, points[i : i + step], d[lit]) @ flux[lit]
+    for band, seen in seen_past_screen(rig, points, d[lit]):
+        out[band] = seen @ flux[lit]
     return out
+
+
+def seen_past_screen(rig: Rig, points: Array, direction: Array) -> Iterator[tuple[slice, Mask]]:
+    """Which directions (m, 3) the screen does not hide from points (n, 3), some points at once."""
+    step = max(1, TABLE_METER.at_once // max(len(direction), 1))
+    for i in range(0, len(points), step):
+        band = slice(i, i + step)
+        yield band, ~hidden_by_screen(rig, points[band], direction)
