@@ -26,8 +26,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import ndimage
 
-from invrender.refine.flat import flat_maps
 from invrender.refine.enlarge import fitting
+from invrender.refine.flat import flat_maps
 from invrender.refine.gauss_newton import BAND, Observation, Refined, linearise
 from invrender.refine.pixels import (
     TOGETHER,
