@@ -22,7 +22,7 @@ SIZE, SMALL = 96, 24
 
 def test_two_large_photos_are_solved_small(monkeypatch):
     """The maps have the photos' size; shrunk, they are those of the photos shrunk."""
-    pytest.importorskip("torch")
+    pytest.importorskip("nets.predict")  # it keeps the size that it finds: for all tests after
     monkeypatch.setattr(module, "WHOLE", 24)
     large = Sample.of(find_lights(load_capture(EXAMPLE)), 48)
     start, result, photos = estimate_maps([large, large], Stages())
