@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -15,7 +16,7 @@ from invrender.lights import Lights
 from invrender.maps import Maps, resize_maps
 from invrender.refine.enlarge import WHOLE, fitting
 from invrender.refine.gauss_newton import linearise
-from invrender.refine.lobes import FIT_SIZE, fit_lobes, lobe_terms, read_lobes
+from invrender.refine.lobes import FIT_SIZE, Lobes, fit_lobes, lobe_terms, read_lobes
 from invrender.refine.theta import to_theta
 from invrender.render.fast.estimator import Fast
 from invrender.render.renderer import Renderer
@@ -71,20 +72,28 @@ class Reconstructor:
 
         terms_of = cache(partial(lobe_terms, renderer))
 
-        def maps_of(photo: Array) -> Prediction:
+        def read(photo: Array) -> Lobes:
             seen = np.clip(np.nan_to_num(photo * scale, posinf=0.0, neginf=0.0), 0, MAX_PHOTO)
-            height, width = photo.shape[:2]
-            terms = terms_of(min(FIT_SIZE, height), min(FIT_SIZE, width))
-            lobes = read_lobes(seen, renderer, terms=terms)
-            out = predict(self.network, batch_of(photo, inputs, lobes))
-            return replace(estimate_of(out, unit), lobes=lobes)
+            terms = terms_of(*(min(FIT_SIZE, n) for n in photo.shape[:2]))
+            return read_lobes(seen, renderer, terms=terms)
 
         large, longest = photo, max(photo.shape[:2])
         if longest > WHOLE:
             photo = resize(photo, *fitting(photo, WHOLE))
-        found = maps_of(photo)
+        photos = [photo]
         if longest > COARSE:
-            found = replace(found, coarse=maps_of(resize(photo, *fitting(photo, COARSE))))
+            photos.append(resize(photo, *fitting(photo, COARSE)))
+        # The network works at one size while the lobes of the next are read.
+        with ThreadPoolExecutor(len(photos)) as beside:
+            asked = []
+            for photo in photos:
+                lobes = read(photo)
+                batch = batch_of(photo, inputs, lobes)
+                asked.append((lobes, beside.submit(predict, self.network, batch)))
+        found, *coarse = (
+            replace(estimate_of(out.result(), unit), lobes=lobes) for lobes, out in asked
+        )
+        found = replace(found, coarse=coarse[0] if coarse else None)
         report(1.0)
         return enlarged(found, large) if longest > WHOLE else found
 

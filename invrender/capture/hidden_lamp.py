@@ -67,9 +67,8 @@ def _part_lights(rig: Rig, at: Array, environment: Array, part: Array) -> Array:
     label = part[: len(part) // 2].ravel()
     behind = np.flatnonzero(label >= 0)
     seen = ~hidden_by_screen(rig, at, d[behind])
-    own = np.zeros((HIDDEN_LAMP.parts**2, len(behind), 3))
-    own[label[behind], np.arange(len(behind))] = flux[behind]
-    return np.tensordot(own, seen.astype(float), (1, 1)).swapaxes(1, 2)
+    own = (label[behind] == k for k in range(HIDDEN_LAMP.parts**2))
+    return np.stack([seen[:, part].astype(float) @ flux[behind][part] for part in own])
 
 
 class _Shading:

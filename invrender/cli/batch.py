@@ -7,13 +7,16 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from invrender.cli.beside import Submit, beside, cores
+from invrender.cli.beside import beside, cores
 from invrender.files.output import check_output
 from invrender.report.report import Report
 from invrender.tasks import map_tasks
 from invrender.types import InputError
+
+if TYPE_CHECKING:
+    from invrender.cli.beside import Submit
 
 
 @dataclass(frozen=True)

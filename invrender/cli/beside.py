@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-Submit = Callable[..., Future[Any]]
+if TYPE_CHECKING:  # which takes `invrender --help` a third of its time
+    from concurrent.futures import Future
+
+    Submit = Callable[..., Future[Any]]
 
 
 def cores() -> int:
@@ -23,6 +24,9 @@ def cores() -> int:
 def beside() -> Iterator[Submit]:
     """A process of its own; what is yielded submits a call to it, which must be importable, and
     returns the call's future. The process ends with the block, at once where an error ends it."""
+    import multiprocessing
+    from concurrent.futures import ProcessPoolExecutor
+
     before = set(multiprocessing.active_children())
     # A copy of this process has what is loaded; with threads of Dr.Jit or torch it might hang.
     copied = sys.platform == "linux" and not {"drjit", "torch"} & sys.modules.keys()

@@ -43,7 +43,7 @@ def steel():
     return noisy_photo(STEEL)
 
 
-@pytest.mark.parametrize("reflectance", [0.42, 0.7, 0.95])
+@pytest.mark.parametrize("reflectance", [0.42, pytest.param(0.7, marks=pytest.mark.slow), 0.95])
 def test_a_ball_is_found_before_its_reflectance_is_known(reflectance):
     rig = replace(RIG, ball_reflectance=(reflectance, 0.97 * reflectance, 0.92 * reflectance))
     ball = find_ball(noisy_photo(rig, grey_table), RIG)
@@ -86,8 +86,15 @@ def test_a_stated_reflectance_is_used_and_doubted(steel):
     assert not right.notices
 
 
-@pytest.mark.parametrize("table", [grey_table, textured_table])
-@pytest.mark.parametrize("radius", [0.0095, 0.0125])
+@pytest.mark.parametrize(
+    ("table", "radius"),
+    [
+        (grey_table, 0.0125),
+        (textured_table, 0.0095),
+        pytest.param(grey_table, 0.0095, marks=pytest.mark.slow),
+        pytest.param(textured_table, 0.0125, marks=pytest.mark.slow),
+    ],
+)
 def test_a_full_sphere_is_recognised(table, radius):
     sphere = replace(STEEL, ball_shape="sphere", ball_radius=radius)
     nominal = replace(RIG, ball_radius=radius)
@@ -120,7 +127,7 @@ def test_beside_the_sheet_the_balls_size_decides_its_shape(monkeypatch):
         assert found.rig.ball_shape == shape
 
 
-@pytest.mark.parametrize("fov", [52.0, 84.0])
+@pytest.mark.parametrize("fov", [52.0, pytest.param(84.0, marks=pytest.mark.slow)])
 def test_the_field_of_view_is_measured_by_the_ball(fov):
     true = replace(STEEL, fov=fov)
     found = find_fov(noisy_photo(true), RIG)
@@ -136,7 +143,7 @@ def test_a_photo_cropped_off_centre_is_refused(steel):
         find_lights(Capture(cropped, RIG, PATTERN))
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(k, marks=pytest.mark.slow) for k in (2, 3))])
 def test_a_straight_camera_stays_straight_under_noise(seed):
     table = (grey_table, textured_table)[seed % 2]
     photo = noisy_photo(RIG, table, noise=0.02 * (seed + 1), seed=seed)

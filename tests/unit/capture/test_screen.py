@@ -118,7 +118,7 @@ def test_a_display_that_dims_and_mixes_keeps_its_gain():
     np.testing.assert_allclose(found.device.gamma, DISPLAY.gamma, atol=0.03)
 
 
-@pytest.mark.parametrize("falloff", [2.0, 6.0])
+@pytest.mark.parametrize("falloff", [2.0, pytest.param(6.0, marks=pytest.mark.slow)])
 def test_no_display_is_believed_to_dim_more_than_any(falloff):
     pattern = noise_pattern()
     image = photograph(MOVED, *SIZE, pattern=pattern, gain=GAIN, falloff=falloff)

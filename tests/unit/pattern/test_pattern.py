@@ -344,8 +344,8 @@ def test_page_is_one_file_of_the_rigs_size(tmp_path):
     [
         ("iPad Pro 11", (2420, 1668)),
         ("11-inch iPad Air", (2360, 1640)),
-        ('galaxy tab s9 ultra 14.6"', (2960, 1848)),
         ("ipad mini", (2266, 1488)),
+        pytest.param('galaxy tab s9 ultra 14.6"', (2960, 1848), marks=pytest.mark.slow),
     ],
 )
 def test_tablets_are_known_by_name(name, pixels, tmp_path):
