@@ -57,7 +57,9 @@ def off(photo, rig, true):
     return np.linalg.norm(a - b, axis=-1).mean() / np.linalg.norm(b[1] - b[0])
 
 
-@pytest.mark.parametrize("table", [pytest.param(grey_table, marks=pytest.mark.slow), textured_table])
+@pytest.mark.parametrize(
+    "table", [pytest.param(grey_table, marks=pytest.mark.slow), textured_table]
+)
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_moved_camera_is_found(table, seed):
     rig = held(seed)

@@ -147,7 +147,9 @@ def test_ball_is_found_in_damaged_photos(clean, tmp_path, damage):
     assert ball.confidence > BALL_SEARCH.least_confidence
 
 
-@pytest.mark.parametrize("table", [pytest.param(grey_table, marks=pytest.mark.slow), textured_table])
+@pytest.mark.parametrize(
+    "table", [pytest.param(grey_table, marks=pytest.mark.slow), textured_table]
+)
 def test_no_ball_is_refused(table, monkeypatch):
     """And soon: the rim, which takes longest, is not fitted at places that look like no ball."""
     fitted = []
