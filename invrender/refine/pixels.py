@@ -20,6 +20,7 @@ from invrender.types import TINY, Array
 
 MOST = 1e12  # mean squared residual over its variance, so that its square is finite
 CHI_SQUARED_QUARTILE = 1.213  # the lower one, of three degrees of freedom
+LEAST_FREE = 0.1  # share of the noise that a fit leaves, at least
 FREE_DIFFUSE = 1.15  # k_d, as it is solved for
 
 
@@ -29,9 +30,9 @@ class Settings:
     materials (docs/research-log/2026-11-29-several-photos.md)."""
 
     photo_noise: tuple[float, float] = (0.01, 0.004)  # of the pixel and the photo's mean, at least
+    grey_noise: float = 0.7  # correlation of the colours' noise: 0.2 to 0.95 at the true maps
     quantile: float = 0.25  # of the residuals, by which noise is judged: many pixels may be lost
-    exposure: float = 0.05  # deviation of the logarithm of a photo's factor a colour
-    exposure_found: float = 0.02  # and of what is found of it
+    rounds: int = 3  # of the photos' factors and noise, and of the relief
     unlikely: float = 9.0  # mean squared residual over its variance that counts half
     diffuse: float = 0.3  # prior deviations of θ, of a dielectric
     around: int = 3  # pixels a side whose misfits are taken together
@@ -41,7 +42,8 @@ class Settings:
     dielectric_f0: float = 0.003  # with 0.01 it grows with the photos, and takes up their errors
     roughness: float = 0.25
     slope: float = 0.6  # at most, of what the photos show of the relief
-    least_slope: float = 0.05
+    least_slope: float = 0.01
+    most_share: float = 1.5  # of the initial slopes, that photos show of them
     metal_diffuse: float = 0.01  # and of a metal
     metal_f0: float = 0.3
     f0_range: tuple[float, float] = (0.08, 0.2)  # surely dielectric; surely metal
@@ -135,13 +137,14 @@ class Point:
 
 @dataclass(frozen=True)
 class Term:
-    """Of a photo at some θ: its rendering, the residual and the residual's weight (h, W, 3), the
-    Jacobian (h, W, 3, 9), and the mean squared residual over its variance (h, W)."""
+    """Of a photo at some θ: its rendering (h, W, 3); the residual (h, W, 3) and the Jacobian
+    (h, W, 3, 9), both times ``root`` (h, W, 3, 3), of the residual's weight; and the mean squared
+    residual over its variance (h, W)."""
 
     image: Array
     residual: Array
     jacobian: Array
-    weight: Array
+    root: Array
     misfit: Array
 
 
@@ -166,9 +169,8 @@ class Problem:
         misfits = []
         for term in self.terms(theta):
             cost += 3 * term.misfit / (1 + term.misfit / self.s.unlikely)
-            weighted = term.jacobian * term.weight[..., None]
-            hessian += np.swapaxes(weighted, -1, -2) @ term.jacobian
-            gradient += np.einsum("hwcp,hwc->hwp", weighted, term.residual)
+            hessian += np.swapaxes(term.jacobian, -1, -2) @ term.jacobian
+            gradient += np.einsum("hwcp,hwc->hwp", term.jacobian, term.residual)
             misfits.append(term.misfit)
         return Point(theta, cost, gradient, hessian, np.stack(misfits))
 
@@ -178,17 +180,28 @@ class Problem:
 
     def terms(self, theta: Array) -> Iterator[Term]:
         """What each photo says of θ, one after another."""
+        white = whitening(self.s)
         for photo in self.photos:
             image, jacobian = linearise(
                 photo.observation.renderer, theta, self.samples,
                 top=self.rows.start, height=self.height,
             )  # fmt: skip
             variance = photo.variance(self.rows, self.s)
-            residual = photo.observation.photo[self.rows] - image
-            misfit = np.minimum((residual**2 / variance).mean(-1), np.float32(MOST))
+            root = white / np.sqrt(variance)[..., None, :]
+            residual = (root @ (photo.observation.photo[self.rows] - image)[..., None])[..., 0]
+            misfit = np.minimum((residual**2).mean(-1), np.float32(MOST))
             forgotten = 1 + misfit / self.s.unlikely
-            weight = 1 / (variance * (forgotten**2)[..., None])
-            yield Term(image, residual, jacobian, weight, misfit)
+            root /= forgotten[..., None, None]
+            yield Term(image, residual / forgotten[..., None], root @ jacobian, root, misfit)
+
+    def left_free(self, point: Point) -> Array:
+        """Of each photo's noise (n,), the share that a fit of θ leaves: the median of pixels."""
+        covariance = np.linalg.inv(point.hessian)
+        fitted = [
+            np.einsum("hwcp,hwpq,hwcq->hw", t.jacobian, covariance, t.jacobian) / 3
+            for t in self.terms(point.theta)
+        ]
+        return np.array([max(1 - float(np.median(f)), LEAST_FREE) for f in fitted])
 
     def search(self, start: Array, steps: int) -> tuple[Point, bool]:
         """`solve`; and where pixels are lost, the better of it and of steps that a narrow lobe or a
@@ -275,11 +288,18 @@ def wide_deviations(theta: Array, rho: Array, s: Settings) -> Array:
     return sigma
 
 
-def noise_of(misfit: Array, s: Settings) -> Array:
+def noise_of(misfit: Array, s: Settings, free: Array | None = None) -> Array:
     """Each photo's noise (n,) in units of the one that its variance assumes, by the lower quartile
-    of the pixels' misfits (n, h, W): a share of what the noise leaves is fitted."""
+    of the pixels' misfits (n, h, W). free: the share (n,) of the noise that a fit leaves."""
+    free = np.full(len(misfit), free_share(len(misfit))) if free is None else free
     scatter = np.quantile(misfit.reshape(len(misfit), -1), s.quantile, 1)
-    return np.asarray(np.sqrt(scatter / (CHI_SQUARED_QUARTILE / 3 * free_share(len(misfit)))))
+    return np.asarray(np.sqrt(scatter / (CHI_SQUARED_QUARTILE / 3 * free)))
+
+
+def whitening(s: Settings) -> Array:
+    """(3, 3): what makes colours' correlated noise independent."""
+    values, vectors = np.linalg.eigh(np.full((3, 3), s.grey_noise) + (1 - s.grey_noise) * np.eye(3))
+    return np.asarray(vectors @ np.diag(values**-0.5) @ vectors.T, np.float32)
 
 
 def free_share(photos: int) -> float:

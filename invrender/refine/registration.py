@@ -14,16 +14,18 @@ keeps a photo in its place where it has no texture. The first photo's place is e
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from invrender.refine.gauss_newton import Observation
 from invrender.refine.pixels import (
     TOGETHER,
     Photo,
+    Point,
     Problem,
     Settings,
     Term,
@@ -84,7 +86,10 @@ def register(
     n = len(observations)
     places, factors = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3, 3))
     deviations, noise = np.zeros(n), np.full(n, r.noise)
+    place = [r.shift] * 6 + [r.perspective] * 2
     expected = [factor_deviations(o, r) for o in observations]
+    deviation = np.array([[*place, *[middle, slant, slant] * 3] for middle, slant in expected])
+    keep = np.arange(n * (PLACE + FACTOR)).reshape(n, -1) >= PLACE  # the first photo stays
     theta: Array | None = None
     last = 0
     for side, steps in zip(r.sides, r.steps, strict=True):
@@ -102,7 +107,12 @@ def register(
         point, _ = problem.solve(start if theta is None else theta, steps)
         theta = point.theta
         noise = np.maximum(noise * noise_of(point.misfit, s), 1.0)
-        step, covariance = _step(problem, theta, point.hessian, factors, expected, r)
+        now = np.concatenate([np.zeros((n, PLACE)), factors.reshape(n, FACTOR)], 1)
+        step, covariance = _step(
+            problem, theta, point.hessian,
+            lambda i, term, moved=moved: _derivative(term, moved[i].observation.photo),
+            now, deviation, keep, r,
+        )  # fmt: skip
         for i in range(n):
             places[i] = places[i] @ _homography(step[i, :PLACE], r)
             places[i] /= places[i, 2, 2]
@@ -190,49 +200,68 @@ def _derivative(term: Term, photo: Array) -> Array:
     Gradients are the mean of the photo's and of its rendering's (Malis 2004): of second order.
     """
     height, width = photo.shape[:2]
-    dx, dy, psi = _fields(height, width)
+    dx, dy, _ = _fields(height, width)
     down, right = np.gradient((photo + term.image) / 2, axis=(0, 1))
     by_x, by_y = right * (width / 2), -down * (height / 2)
     out = np.zeros((height, width, 3, PLACE + FACTOR), np.float32)
     out[..., :PLACE] = -(by_x[..., None] * dx[:, :, None] + by_y[..., None] * dy[:, :, None])
-    for c in range(3):
-        out[..., c, PLACE + 3 * c : PLACE + 3 * c + 3] = term.image[..., c : c + 1] * psi
+    out[..., PLACE:] = _factor_derivative(term.image)
     return out
 
 
+def _factor_derivative(image: Array) -> Array:
+    """Of a photo's rendering by g (H, W, 3, 9)."""
+    psi = _fields(*image.shape[:2])[2]
+    out = np.zeros((*image.shape, FACTOR), np.float32)
+    for c in range(3):
+        out[..., c, 3 * c : 3 * c + 3] = image[..., c : c + 1] * psi
+    return out
+
+
+def find_factors(problem: Problem, point: Point, factors: Array) -> Array:
+    """The photos' factors (n, 3, 3), of which ``factors`` are divided out of the problem's photos,
+    as they are likeliest while all pixels' θ are free within their prior; what all share is the
+    albedo's."""
+    r = REGISTRATION
+    expected = [factor_deviations(p.observation, r) for p in problem.photos]
+    deviation = [[middle, slant, slant] * 3 for middle, slant in expected]
+    n = len(factors)
+    step, _ = _step(
+        problem, point.theta, point.hessian, lambda i, term: _factor_derivative(term.image),
+        factors.reshape(n, FACTOR), np.array(deviation), np.ones((n, FACTOR), bool), r,
+    )  # fmt: skip
+    factors = factors + step.reshape(n, 3, 3)
+    return np.asarray(factors - factors.mean(0))
+
+
 def _step(
-    problem: Problem, theta: Array, hessian: Array, factors: Array,
-    expected: Sequence[tuple[float, float]], r: RegistrationSettings,
+    problem: Problem, theta: Array, hessian: Array, derivative: Callable[[int, Term], Array],
+    now: Array, deviation: Array, keep: NDArray[np.bool_], r: RegistrationSettings,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """The next step (n, 17) of all photos' places and factors, and each photo's covariance."""
-    size = PLACE + FACTOR
-    n = len(problem.photos)
+    """The next step (n, m) of what all pixels of a photo share, and each photo's covariance.
+
+    derivative: of photo i's residual by it, (H, W, 3, m), with the sign of the Jacobian by θ. now,
+    deviation (n, m): of its prior, whose mean is nought. keep (n, m): what is free."""
+    n, size = now.shape
     root = np.linalg.inv(np.linalg.cholesky(hessian))  # L⁻¹
     data, right = np.zeros((n * size, n * size)), np.zeros(n * size)
     coupled = []
     pull = -np.einsum("hwpq,hwq->hwp", problem.prior_precision(), theta - problem.mean)
     for i, term in enumerate(problem.terms(theta)):
-        d = _derivative(term, problem.photos[i].observation.photo)
+        d = term.root @ derivative(i, term)
         at = slice(i * size, (i + 1) * size)
-        weighted = d * term.weight[..., None]
-        rows = weighted.reshape(-1, size).T.astype(np.float64)
+        rows = d.reshape(-1, size).T.astype(np.float64)
         data[at, at] += rows @ d.reshape(-1, size)
         right[at] += rows @ term.residual.reshape(-1)
-        cross = np.swapaxes(term.jacobian, -1, -2) @ weighted
+        cross = np.swapaxes(term.jacobian, -1, -2) @ d
         coupled.append((root @ cross).reshape(-1, size))
-        pull += np.einsum("hwcp,hwc->hwp", term.jacobian * term.weight[..., None], term.residual)
+        pull += np.einsum("hwcp,hwc->hwp", term.jacobian, term.residual)
     stacked = np.concatenate(coupled, 1).astype(np.float64)
     data -= stacked.T @ stacked
     right -= stacked.T @ (root @ pull[..., None]).reshape(-1).astype(np.float64)
-    place = [r.shift] * 6 + [r.perspective] * 2
-    deviation = np.concatenate(
-        [[*place, *[middle, slant, slant] * 3] for middle, slant in expected]
-    )
-    now = np.zeros((n, size))
-    now[:, PLACE:] = factors.reshape(n, -1)
-    precision = r.independent * data + np.diag(1 / deviation**2)
-    right = r.independent * right - now.ravel() / deviation**2
-    keep = np.arange(n * size) >= PLACE  # the first photo stays where it is
+    precision = r.independent * data + np.diag(1 / deviation.ravel() ** 2)
+    right = r.independent * right - (now / deviation**2).ravel()
+    keep = keep.ravel()
     covariance = np.zeros_like(precision)
     covariance[np.ix_(keep, keep)] = np.linalg.inv(precision[np.ix_(keep, keep)])
     step = (covariance @ right).reshape(n, size)

@@ -11,10 +11,11 @@ photos measure, so that the network is only where the search starts: slopes and 
 What is dielectric keeps its f0, and a metal scatters nothing. Roughness is expected to be what the
 photos say of all pixels of the material together (`invrender.refine.shared_roughness`).
 
-Each photo's noise and its exposure are what the others leave of it: Rᵢ grows with its residuals,
-and a factor a colour is taken out. A photo whose residuals are far beyond the others' is left out.
-A pixel's noise is at least as large as what θ leaves of its photos; with it the initial slopes and
-their expected errors count as well, most where no θ explains the photos.
+Each photo's noise and its light are what the others leave of it: Rᵢ grows with its residuals, and
+a factor a colour, which changes evenly across the photo, is taken out. A photo whose residuals are
+far beyond the others' is left out. Slopes are expected to be as large a share of the initial ones
+as the photos show, and spread about that as they show: none on a flat sample. A pixel's noise is at
+least as large as what θ leaves of its photos.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ from invrender.refine.pixels import (
     wide_deviations,
 )
 from invrender.refine.priors import Prior, channel_correlation
-from invrender.refine.registration import factor_deviations
+from invrender.refine.registration import factor_image, find_factors
 from invrender.refine.shared_roughness import Pooled, pool_roughness
 from invrender.refine.theta import D, N, R, S, project, to_maps, to_theta
 from invrender.sampling import centres, resize, resize_pattern
@@ -110,8 +111,11 @@ def explain_together(
     theta = project(prior.mean.copy())
     result = Refined(to_maps(theta), prior.expected.copy())
     try:
-        photos, result.left_out = _calibrate(observations, theta, samples, s)
+        photos, result.left_out, wide = _calibrate(observations, theta, samples, s)
+        photos, share, spread = _lights_and_relief(photos, theta, wide, samples, s)
         progress(0.1)
+        theta[..., N] *= share
+        s = replace(s, slope=spread)
         found = _explain_all(photos, theta, prior.expected, samples, progress, s)
         result.maps, result.sigma = to_maps(found.theta), found.sigma
         result.photo_errors, result.converged = found.photo_errors, found.converged
@@ -137,7 +141,6 @@ def _explain_all(
     else:
         mode, shares = theta, s.spread
     pooled = _pool(photos, theta, mode, sigma[..., R], samples, s)
-    s = replace(s, slope=_relief(photos, pooled, theta, samples, s))
     for k, own in enumerate(shares):
         if k:  # materials are told apart by what was found, in which there is less light
             pooled = _pool(photos, theta, mode, sigma[..., R], samples, s)
@@ -159,13 +162,18 @@ def _small(photos: Sequence[Photo], theta: Array, rho: float, samples: int, s: S
 
 def _calibrate(
     observations: Sequence[Observation], theta: Array, samples: int, s: Settings
-) -> tuple[list[Photo], list[int]]:
-    """The photos with their noise and without their own exposure, by what the others leave of
-    them; and which are left out."""
+) -> tuple[list[Photo], list[int], Array]:
+    """The photos with their noise, by what the others leave of them; which are left out; and θ of
+    few pixels as they show it with next to no prior."""
     photos = dict(enumerate(map(Photo.of, observations)))
     while True:
         problem = _small(list(photos.values()), theta, s.roughness, samples, s)
         point, _ = problem.search(problem.mean, s.tried)
+        if len(photos) > 2:
+            factors = find_factors(problem, point, np.zeros((len(photos), 3, 3)))
+            exposed = [_without_factor(*p) for p in zip(photos.values(), factors, strict=True)]
+            problem = _small(exposed, theta, s.roughness, samples, s)
+            point, _ = problem.solve(point.theta, s.tried)
         scatter = noise_of(point.misfit, s)
         excess = [
             own / max(float(np.median(np.delete(scatter, i))), 1e-6) if len(photos) > 2 else 0.0
@@ -175,24 +183,46 @@ def _calibrate(
         if excess[worst] < s.bad or scatter[worst] * s.photo_noise[0] < s.bad_at_least:
             break
         del photos[list(photos)[worst]]
-    few = problem.photos
-    logs = np.zeros((len(few), 3))
-    for i, photo in enumerate(few):
-        image, _ = linearise(photo.observation.renderer, point.theta, samples)
-        ratio = np.log(np.maximum(photo.observation.photo, TINY) / np.maximum(image, TINY))
-        logs[i] = np.median(ratio.reshape(-1, 3), 0)
-    logs -= logs.mean(0)
-    doubts = [factor_deviations(p.observation)[0] for p in photos.values()]
-    spread = np.array([min(s.exposure, d) ** 2 for d in doubts])[:, None]
-    logs *= spread / (spread + s.exposure_found**2)
-    exposed = []
-    for photo, log in zip(photos.values(), logs, strict=True):
-        o = photo.observation
-        exposed.append(Photo.of(replace(o, photo=o.photo * np.exp(-log).astype(np.float32))))
-    point, _ = _small(exposed, theta, s.roughness, samples, s).solve(point.theta, s.tried)
-    scatter = np.maximum(noise_of(point.misfit, s), 1.0)
-    noisy = [replace(p, noise=float(own)) for p, own in zip(exposed, scatter, strict=True)]
-    return noisy, [i for i in range(len(observations)) if i not in photos]
+    scatter = np.maximum(scatter, 1.0)
+    noisy = [replace(p, noise=float(k)) for p, k in zip(photos.values(), scatter, strict=True)]
+    return noisy, [i for i in range(len(observations)) if i not in photos], point.theta
+
+
+def _lights_and_relief(
+    photos: Sequence[Photo], theta: Array, wide: Array, samples: int, s: Settings
+) -> tuple[list[Photo], float, float]:
+    """The photos without their own factors, with the noise that is left then; and of the slopes the
+    share of the initial ones, θ's, that photos show, and the spread about it. wide: of
+    `_calibrate`.
+
+    A factor that changes across a photo looks like slopes of all pixels; so factors are found with
+    slopes that spread no more than the photos show.
+    """
+    factors: Array = np.zeros((len(photos), 3, 3))
+    noise = np.array([p.noise for p in photos])
+    found, share, spread = list(photos), 1.0, s.slope
+    for _ in range(s.rounds):
+        problem = _small(found, theta, s.roughness, samples, s)
+        point, _ = problem.solve(wide, s.tried)
+        wide = point.theta
+        share, spread = _relief(point, problem, s)
+        narrow = _small(found, theta, s.roughness, samples, replace(s, slope=spread))
+        narrow.mean[..., N] *= share
+        point, _ = narrow.solve(wide, s.tried)
+        noise = np.maximum(noise * noise_of(point.misfit, s, narrow.left_free(point)), 1.0)
+        factors = find_factors(narrow, point, factors)
+        found = [
+            replace(_without_factor(p, f), noise=float(k))
+            for p, f, k in zip(photos, factors, noise, strict=True)
+        ]
+    return found, share, spread
+
+
+def _without_factor(photo: Photo, factor: Array) -> Photo:
+    """The photo, its factor divided out."""
+    o = photo.observation
+    shown = o.photo / factor_image(factor, *o.photo.shape[:2])
+    return replace(photo, observation=replace(o, photo=shown))
 
 
 def _pool(
@@ -221,19 +251,17 @@ def _features_of(mode: Array, theta: Array) -> Array:
     return both
 
 
-def _relief(
-    photos: Sequence[Photo], pooled: Pooled, theta: Array, samples: int, s: Settings
-) -> float:
-    """The deviation of slopes from θ's that photos show: the spread of what is found of few pixels,
-    without its own error (moments' estimate)."""
-    problem = _small(photos, theta, s.fixed, samples, s)
-    problem.mean[..., R], problem.sigma[..., R] = pooled.roughness(problem.mean)
-    point, _ = problem.search(problem.mean, s.steps)
+def _relief(point: Point, problem: Problem, s: Settings) -> tuple[float, float]:
+    """The share of the initial slopes that photos show, and the deviation of the slopes from it:
+    regression and moments, without the error of what is found with next to no prior."""
     variance = np.linalg.inv(point.hessian)[..., (7, 8), (7, 8)]
-    square = (point.theta[..., N] - problem.mean[..., N]) ** 2
+    initial, slopes = problem.mean[..., N], point.theta[..., N]
     weight = 1 / (variance + s.least_slope**2)
+    share = float((weight * slopes * initial).sum() / max((weight * initial**2).sum(), TINY))
+    share = float(np.clip(share, 0, s.most_share))
+    square = (slopes - share * initial) ** 2
     excess = float((weight * (square - variance)).sum() / weight.sum())
-    return float(np.clip(np.sqrt(max(excess, 0)), s.least_slope, s.slope))
+    return share, float(np.clip(np.sqrt(max(excess, 0)), s.least_slope, s.slope))
 
 
 def _solve_all(
@@ -263,7 +291,7 @@ def _solve_all(
         point, done = solve(found.mode[band], steps)
         found.converged &= done
         found.mode[band] = point.theta
-        weighed, covariance = _weighed(problem, point, theta[band], sigma[band])
+        weighed, covariance = _weighed(problem, point)
         found.theta[band] = project(weighed)
         variance = np.einsum("hwpp->hwp", covariance)
         variance[..., :6] += (s.lights_error * point.theta[..., :6]) ** 2
@@ -279,14 +307,11 @@ def _solve_all(
     return found
 
 
-def _weighed(
-    problem: Problem, point: Point, initial: Array, expected: Array
-) -> tuple[Array, Array]:
-    """θ (h, W, 9) and its covariance, with noise as large as what θ leaves of a pixel's photos, and
-    with the initial slopes and their expected errors.
+def _weighed(problem: Problem, point: Point) -> tuple[Array, Array]:
+    """θ (h, W, 9) and its covariance, with noise as large as what θ leaves of a pixel's photos.
 
-    What no θ explains, such as relief finer than a pixel, has measured little: there the initial
-    slopes count for most, and the prior for the rest.
+    What no θ explains, such as relief finer than a pixel, has measured little: there the prior
+    counts for most.
     """
     s = problem.s
     misfit = np.minimum(point.misfit, s.most_misfit)
@@ -294,12 +319,9 @@ def _weighed(
     misfit = misfit.mean(0) / free_share(len(misfit))
     misfit = np.maximum(misfit, ndimage.median_filter(misfit, s.around, mode="nearest"))
     excess = np.maximum(misfit * trust, 1.0)[..., None]
-    wide, slopes = problem.prior_precision(), np.arange(9)[N]
-    known = np.zeros_like(wide)
-    known[..., slopes, slopes] = 1 / expected[..., N] ** 2
+    wide = problem.prior_precision()
     drawn = np.einsum("hwpq,hwq->hwp", wide, point.theta - problem.mean)
     data = (point.hessian - wide) / excess[..., None]
     pull = (point.gradient + drawn) / excess - drawn
-    pull -= np.einsum("hwpq,hwq->hwp", known, point.theta - initial)
-    covariance = np.linalg.inv(data + wide + known)
+    covariance = np.linalg.inv(data + wide)
     return point.theta + np.einsum("hwpq,hwq->hwp", covariance, pull), covariance

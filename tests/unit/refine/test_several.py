@@ -14,9 +14,10 @@ from invrender.maps import constant_maps, map_errors
 from invrender.pattern.default import default_pattern
 from invrender.refine.gauss_newton import Observation
 from invrender.refine.priors import network_prior
+from invrender.refine.registration import factor_image
 from invrender.refine.several import by_pattern, explain_together, plain_prior
 from invrender.refine.shared_roughness import TRIED_ROUGHNESS, pool_roughness
-from invrender.refine.theta import R, to_maps, to_theta
+from invrender.refine.theta import N, R, to_maps, to_theta
 from invrender.render.fast.estimator import Fast
 from invrender.rig import Rig
 from invrender.sphere import scale_environment
@@ -91,6 +92,28 @@ def test_a_photo_s_own_exposure_and_another_sample_are_found(truth, renderers, f
     before, after = (map_errors(f.maps, truth) for f in (found, drifted))
     assert after["normal"] < 1.4 * before["normal"]
     assert after["average"] < 1.3 * before["average"] + 0.003
+
+
+def test_a_flat_sample_stays_flat(renderers):
+    """Under lights that are found a little wrong, otherwise in each photo, with initial wrinkles;
+    colours' noise is alike, so that five photos have hardly more than five numbers a pixel."""
+    maps = constant_maps(SIZE, SIZE, 0.3, 0.04, 0.8)
+    rng = np.random.default_rng(2)
+    factors = np.array([0.01, 0.02, 0.02]) * rng.standard_normal((len(renderers), 1, 3))
+    photos = [
+        replace(o, photo=o.photo * factor_image(np.tile(f, (3, 1)), SIZE, SIZE) * (1 + grey))
+        for o, f, grey in zip(
+            photos_of(maps, renderers), factors,
+            0.01 * rng.standard_normal((len(renderers), SIZE, SIZE, 1)).astype(np.float32),
+            strict=True,
+        )
+    ]  # fmt: skip
+    theta = to_theta(maps)
+    theta[..., N] = 0.1 * rng.standard_normal((SIZE, SIZE, 2))
+    prior = network_prior(to_maps(theta), {k: np.full(maps.shape, 0.05, np.float32) for k in NAMES})
+    slopes = to_theta(explained(photos, prior).maps)[..., N]
+    assert np.sqrt((slopes**2).mean()) < 0.02
+    assert np.abs(slopes.mean((0, 1))).max() < 0.005
 
 
 def test_a_blurred_photo_does_no_harm(truth, renderers, found):
