@@ -108,11 +108,12 @@ def register(
         theta = point.theta
         noise = np.maximum(noise * noise_of(point.misfit, s), 1.0)
         now = np.concatenate([np.zeros((n, PLACE)), factors.reshape(n, FACTOR)], 1)
-        step, covariance = _step(
-            problem, theta, point.hessian,
-            lambda i, term, moved=moved: _derivative(term, moved[i].observation.photo),
-            now, deviation, keep, r,
-        )  # fmt: skip
+        shown = [p.observation.photo for p in moved]
+
+        def derivative(i: int, term: Term, shown: Sequence[Array] = shown) -> Array:
+            return _derivative(term, shown[i])
+
+        step, covariance = _step(problem, theta, point.hessian, derivative, now, deviation, keep, r)
         for i in range(n):
             places[i] = places[i] @ _homography(step[i, :PLACE], r)
             places[i] /= places[i, 2, 2]
