@@ -66,14 +66,14 @@ def measure(shot: Shot) -> dict[str, Any] | None:
     size = (photo.height, photo.width)
     image = trace_image(rig, make_ball(rig, shot.ball, rig.ball_radius, size))
     environment, coverage = unfold_environment(photo, rig, image)
+    environment = fill_environment(environment, coverage)
     clipped = clipped_light(photo, rig, image, len(environment))
     if (clipped.max(-1) > 0).mean() < LIT / 2:
         return None
     level = photo.clip_level / np.asarray(rig.ball_reflectance)
     x = environment / level
-    raised, factor, _, _ = raise_clipped(
-        photo, rig, image, (shot.pattern, shot.gain, shot.device), environment, coverage
-    )  # fmt: skip
+    lit = shot.pattern, shot.gain, shot.device
+    raised, factor, *_ = raise_clipped(photo, rig, image, lit, environment)
     results: list[Array] = [
         environment, environment + clipped,
         x * x.mean(-1, keepdims=True) ** 2, raised,
@@ -87,7 +87,7 @@ def measure(shot: Shot) -> dict[str, Any] | None:
     true = light(truth)
     row: dict[str, Any] = {"photo": shot.name, "factor": factor}
     for name, result in zip(METHODS, results, strict=True):
-        found = light(fill_environment(result.astype(np.float32), coverage))
+        found = light(result.astype(np.float32))
         if name == PAPER:
             found = found * (true[0] / found[0])
         error = found - true

@@ -123,7 +123,9 @@ class Lights:
     straight down, in degrees,
     ``curve_exponent`` the standard deviation of the power of light that is left of a tone curve,
     ``ball_reflectance`` the mirror's and ``ball_reflectance_deviation`` the standard deviation of
-    its logarithm (0: it was stated), with which all radiance here scales.
+    its logarithm (0: it was stated), with which all radiance here scales; ``light_deviation`` that
+    of the logarithm of all light on the sample, and ``screen_doubt``, ``lamps_doubt`` and
+    ``hidden_doubt`` what the screen, saturated lamps and the room behind the screen add to it.
 
         lights = Lights(Rig(), default_pattern(), gain=2.0)
     """

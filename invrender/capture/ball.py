@@ -32,6 +32,7 @@ from invrender.capture.robust import spread
 from invrender.capture.settings import (
     BALL_SEARCH,
     BALL_VIEW,
+    DISPLAY,
     FIELD_OF_VIEW,
     MIRRORED_TABLE,
     RIM_FIT,
@@ -215,13 +216,17 @@ def _search(
 
 def measure_reflectance(photo: Photo, rig: Rig, ball: Ball) -> Ball:
     """The ball with its mirror's reflectance and that logarithm's standard deviation, by the table
-    seen in it against the table seen directly; without, where the photo shows too little of it."""
+    seen in it against the table seen directly; without, where the photo shows too little of it.
+
+    What is left of a tone curve changes that logarithm as it changes any."""
     reach = (BALL_SEARCH.reach + BALL_SEARCH.view_margin) * ball.radius
     view = view_around(photo, np.asarray(ball.centre), reach, ball.radius / BALL_SEARCH.view_radius)
     circle = np.array([*ball.position[:2], ball.radius_m])
     reflectance, deviation = _measured_reflectance(view, rig, circle)
     if reflectance is None:
         return ball
+    exponent = photo.curve_deviation / -math.log(DISPLAY.sample)
+    deviation = math.hypot(deviation, exponent * float(np.log(reflectance).mean()))
     return replace(ball, reflectance=reflectance, reflectance_deviation=deviation)
 
 
@@ -252,8 +257,9 @@ def _measured_reflectance(
     seen, table, distance, valid = _table_both_ways(view, rig, circle, blur)
     near, far = MIRRORED_TABLE.measured
     dark = TINY + BALL_VIEW.least_level
-    use = valid & (distance > near) & (distance < far) & (table > dark).all(-1)
-    use &= (seen > dark).all(-1)
+    white = MIRRORED_TABLE.unsaturated * view.white
+    use = valid & (distance > near) & (distance < far)
+    use &= ((np.minimum(seen, table) > dark) & (np.maximum(seen, table) < white)).all(-1)
     if use.sum() < MIRRORED_TABLE.least_share * len(use) / 2:
         return None, math.inf
     ratios = np.sort(np.log(seen[use]) - np.log(table[use]), 0)

@@ -23,14 +23,15 @@ from invrender.types import TINY, Array
 class View:
     """A part of a photo of ``size`` (H, W), shrunk ``step`` times; it begins at ``origin`` (x, y).
 
-    ``image`` (h, w, 3): linear radiance over its median, cut at `BALL_VIEW.brightest`. Photo pixel
-    p is view position (p - origin) / step.
+    ``image`` (h, w, 3): linear radiance over its median, cut at ``white``, where the photo is
+    saturated, at most `BALL_VIEW.brightest`. Photo pixel p is view position (p - origin) / step.
     """
 
     origin: Array
     step: int
     size: tuple[int, int]
     image: Array
+    white: float
 
     @cached_property
     def tone(self) -> Array:
@@ -81,12 +82,9 @@ def view_around(photo: Photo, middle: Array, reach: float, shrink: float) -> Vie
     part = photo.image[low[1] : high[1], low[0] : high[0]]
     part = part.reshape(count[1], step, count[0], step, 3).mean((1, 3))
     level = max(float(np.median(part)), BALL_VIEW.least_level * float(part.max()), TINY)
-    return View(
-        low.astype(float),
-        step,
-        (photo.height, photo.width),
-        np.minimum(part / level, BALL_VIEW.brightest),
-    )
+    white = min((photo.clip_level or math.inf) / level, BALL_VIEW.brightest)
+    image = np.minimum(part / level, BALL_VIEW.brightest)
+    return View(low.astype(float), step, (photo.height, photo.width), image, white)
 
 
 def horizon_curve(view: View, rig: Rig, circle: Array, count: int) -> Array:

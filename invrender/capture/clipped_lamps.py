@@ -8,12 +8,13 @@ colours of its own: the brighter the room, the flatter and less coloured the tab
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage, optimize
 
 from invrender.capture.ball_image import BallImage
-from invrender.capture.environment import fill_environment, unfold_environment
+from invrender.capture.environment import unfold_environment
 from invrender.capture.robust import cauchy_residuals, spread
 from invrender.capture.settings import CLIPPED_LAMPS, TABLE_METER
 from invrender.capture.table import distant_pairs, lit_table, room_irradiance
@@ -24,7 +25,10 @@ from invrender.rig import Rig
 from invrender.types import TINY, Array, Mask
 
 
-def clipped_light(photo: Photo, rig: Rig, image: BallImage, height: int) -> Array:
+def clipped_light(
+    photo: Photo, rig: Rig, image: BallImage, height: int, blur: float = 0.0,
+    white: Array | None = None,
+) -> Array:  # fmt: skip
     """(H, 2H, 3): what of the environment's radiance is clipped.
 
     A JPEG's colours are coarser than its brightness: of a small lamp of which some channel is
@@ -42,15 +46,29 @@ def clipped_light(photo: Photo, rig: Rig, image: BallImage, height: int) -> Arra
     hidden = ~channels[lamp] & (lamp > 0)[..., None]
     clipped |= hidden & (pixels >= CLIPPED_LAMPS.beside * photo.clip_level)
     light[area] = pixels * clipped
-    return unfold_environment(Photo(light), rig, image, height)[0]
+    return unfold_environment(Photo(light), rig, image, height, blur, white)[0]
+
+
+class Raised(NamedTuple):
+    """What `raise_clipped` finds.
+
+    environment: (H, 2H, 3), with the clipped texels raised ``factor`` times, in the channels' mean;
+    gain: factor (3,) on the screen's; lamps: what of the environment is raised light, if any;
+    deviation: of the logarithm of that light.
+    """
+
+    environment: Array
+    factor: float
+    gain: Array
+    lamps: Array | None
+    deviation: float
 
 
 def raise_clipped(
     photo: Photo, rig: Rig, image: BallImage, screen: tuple[Array, Array, Device],
-    environment: Array, coverage: Array, gain_deviation: float = 0.0,
-) -> tuple[Array, float, Array, Array | None]:  # fmt: skip
-    """The environment (H, 2H, 3) with its clipped texels raised; how many times, the mean; the
-    factor (3,) on the screen's gain; and what of the environment is raised light, if any.
+    environment: Array, gain_deviation: float = 0.0, blur: float = 0.0,
+) -> Raised:  # fmt: skip
+    """The filled environment (H, 2H, 3) with its clipped texels raised, and the screen's gain.
 
     The screen: pattern (h, w, 3), gain (3,) and display; ``gain_deviation`` is that of the
     logarithm of its gain, by the ball. One factor per channel is found for all clipped texels, and
@@ -60,25 +78,25 @@ def raise_clipped(
     varies more. That the screen shades the table from the clipped lamps counts too. 1 where nothing
     is clipped, and where the gain is known.
     """
-    clipped = clipped_light(photo, rig, image, len(environment))
+    white = screen[1] if rig.has_screen else None
+    clipped = clipped_light(photo, rig, image, len(environment), blur, white)
     doubted = gain_deviation > CLIPPED_LAMPS.known_gain
     if not (clipped.any() or doubted):
-        return environment, 1.0, np.ones(3), None
-    filled = fill_environment(environment, coverage)
-    seen, at, use, lit, room = lit_table(photo, rig, image.ball, screen, filled)
+        return Raised(environment, 1.0, np.ones(3), None, 0.0)
+    seen, at, use, lit, room = lit_table(photo, rig, image.ball, screen, environment)
     factors = _Factors(seen, use, lit, room, room_irradiance(rig, at, clipped))
     doubt = CLIPPED_LAMPS.gain_doubt * gain_deviation if doubted else 0.0
-    x, y = factors.fit(doubt)
+    x, y, deviation = factors.fit(doubt)
     if doubted:  # textures, and a lamp that the screen hides, spoil the table's word
         told = factors.spread(x, y).max() < CLIPPED_LAMPS.plain
         # What is saturated hides how bright it is, not that it is as bright as that.
         least, most = (CLIPPED_LAMPS.likely_gain * d for d in (-gain_deviation, doubt))
         if not (told and least < y.mean() < most):
-            x, y = factors.fit(0.0)
+            x, y, deviation = factors.fit(0.0)
     factor, gain = np.exp(x), np.exp(y)
     raised = environment + clipped * (factor - 1).astype(np.float32)
     lamps = np.minimum(clipped * factor, raised).astype(np.float32) if clipped.any() else None
-    return np.asarray(raised, np.float32), float(factor.mean()), gain, lamps
+    return Raised(np.asarray(raised, np.float32), float(factor.mean()), gain, lamps, deviation)
 
 
 class _Factors:
@@ -110,11 +128,12 @@ class _Factors:
         spreads = [np.maximum(spread(e, 0), TABLE_METER.least_spread) for e in self.errors(x, y)]
         return np.asarray(np.median(spreads, 0)) if spreads else np.full(3, math.inf)
 
-    def fit(self, doubt: float) -> tuple[Array, Array]:
-        """The most probable ones; the screen's stays where ``doubt``, its deviation, is 0."""
+    def fit(self, doubt: float) -> tuple[Array, Array, float]:
+        """The most probable ones, and the deviation of the clipped light's, the channels' mean; the
+        screen's stays where ``doubt``, its deviation, is 0."""
         free = np.array([self.lamps.any(), doubt > 0]).repeat(3)
         if not free.any():
-            return np.zeros(3), np.zeros(3)
+            return np.zeros(3), np.zeros(3), 0.0
 
         def whole(z: Array) -> tuple[Array, Array]:
             both = np.zeros(6)
@@ -147,8 +166,11 @@ class _Factors:
             inside = CLIPPED_LAMPS.inside
             z = np.clip(z, least + inside, CLIPPED_LAMPS.greatest - inside)
             bounds = (least, CLIPPED_LAMPS.greatest)
-            z = optimize.least_squares(residuals, z, "3-point", bounds, args=(scales,)).x
-        return whole(np.asarray(z))
+            found = optimize.least_squares(residuals, z, "3-point", bounds, args=(scales,))
+            z = np.asarray(found.x)
+        covariance = np.linalg.pinv(found.jac.T @ found.jac)
+        deviation = math.sqrt(float(covariance[:3, :3].mean())) if free[0] else 0.0
+        return *whole(z), deviation
 
 
 def _about(x: Array, mean: float, deviation: float, channels: float) -> Array:

@@ -24,8 +24,17 @@ from invrender.capture.near_lamp import find_near_lamp
 from invrender.capture.orientation import find_ball_and_orientation, not_the_pattern
 from invrender.capture.response import Response
 from invrender.capture.screen import Screen, fit_screen
-from invrender.capture.settings import DISPLAY, PATTERN_CHECK, SCREEN_FIT, TABLE_LEVEL, UNFOLDING
+from invrender.capture.settings import (
+    DISPLAY,
+    MIRRORED_TABLE,
+    PATTERN_CHECK,
+    SCREEN_FIT,
+    STRENGTH,
+    TABLE_LEVEL,
+    UNFOLDING,
+)
 from invrender.capture.sheet import FoundSheet, moved_circle, undone, use_paper, use_sheet
+from invrender.capture.strength import light_deviation, light_doubts, strength_warnings
 from invrender.capture.table import lit_table
 from invrender.capture.vignetting import find_vignetting, without_vignetting
 from invrender.files.capture import Capture
@@ -127,7 +136,7 @@ def find_lights(
         lights = replace(lights, gain=_rgb(gain))
     notices = (
         *capture.warnings, *sheet_notices, *fov_notices, *turned, *mirror, *paper,
-        *light_warnings(lights),
+        *light_warnings(lights), *strength_warnings(lights.fit),
     )  # fmt: skip
     return FoundLights(capture, lights, found, notices, sheet)
 
@@ -171,17 +180,28 @@ def measure_fov(
 
 
 def use_reflectance(capture: Capture, ball: Ball) -> tuple[Capture, tuple[Notice, ...]]:
-    """The capture with the ball's reflectance as measured, where nobody states it and the photo
-    contradicts the default; and what a person should know of it.
+    """The capture with the ball's reflectance where nobody states it: as measured, or as balls
+    have it; and what a person should know of it.
 
     A stated reflectance is used, and doubted where the photo contradicts it.
     """
     measured, deviation = ball.reflectance, ball.reflectance_deviation
-    nominal = capture.rig.ball_reflectance
-    if measured is None or deviation is None or agrees(nominal, measured, deviation):
-        return capture, ()
+    nominal, stated = capture.rig.ball_reflectance, "ball_reflectance" not in capture.unknown
+    if measured is None or deviation is None:
+        if stated:
+            return capture, ()
+        usual = MIRRORED_TABLE.usual
+        text = (
+            f"nothing tells the ball's reflectance; it was taken as {usual:.0%}, ± "
+            f"{MIRRORED_TABLE.usual_deviation:.0%} of that, and albedo scales with it: set [ball] "
+            "reflectance in rig.toml"
+        )
+        rig = replace(capture.rig, ball_reflectance=(usual, usual, usual))
+        return replace(capture, rig=rig), (Notice("ball-reflectance-guessed", text),)
     found = f"{np.mean(measured):.0%} of the light, ± {deviation:.0%} of that"
-    if "ball_reflectance" not in capture.unknown:
+    if stated:
+        if agrees(nominal, measured, deviation):
+            return capture, ()
         text = (
             f"by the table in it the ball reflects {found}, but rig.toml says "
             f"{np.mean(nominal):.0%}, which was used: check [ball] reflectance; albedo scales with "
@@ -230,14 +250,18 @@ def _measure(
         rig = screen.rig
     fit |= _mirror_numbers(capture, rig, ball)
     fit["room_saturated"] = _room_saturated(photo, rig, image)
-    environment, coverage = unfold_environment(photo, rig, image, height, screen.blur)
-    environment, fit["room_raised"], factor, lamps = raise_clipped(
-        photo, rig, image, lit, environment, coverage, screen.gain_deviation
+    environment, coverage = unfold_environment(
+        photo, rig, image, height, screen.blur, screen.gain
     )
-    gain = screen.gain * factor
-    fit["gain_by_table"] = float(factor.mean())
+    seen, environment = environment, fill_environment(environment, coverage)
+    filling = environment - seen
+    raised = raise_clipped(
+        photo, rig, image, lit, environment, screen.gain_deviation, screen.blur
+    )
+    environment, lamps, fit["room_raised"] = raised.environment, raised.lamps, raised.factor
+    gain = screen.gain * raised.gain
+    fit["gain_by_table"] = float(raised.gain.mean())
     lit = capture.pattern, gain, screen.device
-    environment = fill_environment(environment, coverage)
     fit["vignetting"] = 0.0
     table = cache(partial(lit_table, photo, rig, ball, lit, environment))
     if fit["room_raised"] == 1 and screen.saturated <= SCREEN_FIT.saturated:  # the light is known
@@ -254,6 +278,9 @@ def _measure(
     lights = Lights(
         rig, capture.pattern, environment, gain, coverage, captured, fit, screen.device, lamps
     )
+    guess = STRENGTH.hidden_lamp if fit["hidden_lamp"] > 1 else raised.deviation
+    fit |= light_doubts(lights, filling, screen.gain_deviation, guess)
+    fit["light_deviation"] = light_deviation(fit)
     return lights, screen.response
 
 
@@ -264,24 +291,30 @@ def _measure_room(
     fit = {"camera_tilt": rig.off_nadir, "vignetting": 0.0}
     fit |= _mirror_numbers(capture, rig, image.ball)
     fit["room_saturated"] = _room_saturated(photo, rig, image)
-    environment, coverage = unfold_environment(photo, rig, image, height)
-    environment, fit["room_raised"], _, lamps = raise_clipped(
-        photo, rig, image, (NO_PATTERN, np.zeros(3), IDEAL), environment, coverage
-    )
-    environment = fill_environment(environment, coverage)
+    seen, coverage = unfold_environment(photo, rig, image, height)
+    environment = fill_environment(seen, coverage)
+    filling = environment - seen
+    raised = raise_clipped(photo, rig, image, (NO_PATTERN, np.zeros(3), IDEAL), environment)
+    environment, fit["room_raised"] = raised.environment, raised.factor
     near = find_near_lamp(photo, rig, image.ball, environment)
     if near is not None:
         fit["lamp_distance"] = math.dist(near.place, near.seen_from)
     gain = np.zeros(3, np.float32)
-    return Lights(rig, NO_PATTERN, environment, gain, coverage, None, fit, lamps=lamps, near=near)
+    lights = Lights(
+        rig, NO_PATTERN, environment, gain, coverage, None, fit, lamps=raised.lamps, near=near
+    )
+    fit |= light_doubts(lights, filling, 0.0, raised.deviation)
+    fit["light_deviation"] = light_deviation(fit)
+    return lights
 
 
 def _mirror_numbers(capture: Capture, rig: Rig, ball: Ball) -> dict[str, float]:
     """The numbers of `Lights.fit` that tell the mirror's reflectance."""
     known = "ball_reflectance" not in capture.unknown
+    deviation = ball.reflectance_deviation or MIRRORED_TABLE.usual_deviation
     return {
         "ball_reflectance": float(np.mean(rig.ball_reflectance)),
-        "ball_reflectance_deviation": 0.0 if known else ball.reflectance_deviation or 0.0,
+        "ball_reflectance_deviation": 0.0 if known else deviation,
     }
 
 

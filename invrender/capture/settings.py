@@ -104,6 +104,11 @@ class MirroredTable:
     measured: tuple[float, float] = (1.3, 4.0)
     reflectances: tuple[float, float] = (0.35, 1.0)
     tint: float = 0.25
+    unsaturated: float = 0.9  # of white, below which a value is neither saturated nor beside it
+    # Of balls whose reflectance nobody states and the photo does not show: the middle of what
+    # `invrender.data.simulate_setup` draws, and the deviation of its logarithm.
+    usual: float = 0.65
+    usual_deviation: float = 0.2
     independent: float = 20.0  # measurements on the ring that are independent; by hand
     # Of the logarithm of the measured reflectance: the least deviation. On 16 simulated photos at
     # the true place the errors were 0.015 (root mean square) where no glare lay over the ball.
@@ -510,6 +515,12 @@ class Unfolding:
     screen_margin: float = 1.5
     margin_a_blur: float = 1.5
     hidden: float = 0.01  # share of the screen in a look-up that hides the room; by hand
+    # Of the screen's white, above the screen's own light, from which a pixel near it is a lamp's;
+    # share of such a pixel in a look-up that is one; pixels of blur, at least, since the screen's
+    # place is known no better; by hand.
+    brighter: float = 0.3
+    lamp_shown: float = 0.5
+    least_blur: float = 0.5
     floor: float = 1e-3  # of the mean, the least radiance that is continued; by hand
     least_floor: float = 1e-9  # absolute; by hand
     window_margin: float = 4.0  # pixels around the ball's outline; by hand
@@ -555,6 +566,20 @@ class ClippedLamps:
     beside: float = 0.8
     starts: tuple[float, float, int] = (0.05, 4, 10)  # from, to, number; by hand
     inside: float = 1e-6  # distance of a start from the bounds; by hand
+
+
+@dataclass(frozen=True)
+class Strength:
+    """How well the light on the sample is known: `invrender.capture.strength`."""
+
+    # Of the logarithm of the light: from where the screen hides the room from the ball, as it is
+    # filled; of lamps seen right beside the screen; of raised lamps, besides what their fit says.
+    # Of 44 simulated captures' true rooms (docs/research-log/2026-11-30-the-lights-strength.md).
+    hidden: float = 0.78
+    beside: float = 0.2
+    lamps: float = 0.5
+    hidden_lamp: float = 0.3  # of a lamp there that the table's shading shows; by hand
+    warned: float = 0.08  # of the logarithm of all light, from which a person is told; by hand
 
 
 @dataclass(frozen=True)
@@ -660,6 +685,7 @@ PATTERN_CHECK = PatternCheck()
 UNFOLDING = Unfolding()
 TABLE_METER = TableMeter()
 CLIPPED_LAMPS = ClippedLamps()
+STRENGTH = Strength()
 VIGNETTING = Vignetting()
 NEAR_LAMP = NearLampSearch()
 HIDDEN_LAMP = HiddenLamp()

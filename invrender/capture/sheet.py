@@ -589,12 +589,13 @@ def undone(sheet: FoundSheet | None, response: Response) -> FoundSheet | None:
 class PaperLight:
     """The light that the paper shows: the screen's ``gain`` (3,), and factors on what the ball
     shows of the room and, (3,), on what is guessed of it. ``deviation``: of the logarithm of the
-    gain's mean."""
+    gain's mean; ``light``: of that of all light on the paper."""
 
     gain: Array
     room: float
     lamps: Array
     deviation: float
+    light: float
 
 
 def light_on_paper(found: FoundSheet, lights: Lights, doubt: float = math.inf) -> PaperLight | None:
@@ -644,11 +645,16 @@ def light_on_paper(found: FoundSheet, lights: Lights, doubt: float = math.inf) -
     done = least_squares(errors, np.zeros(9))
     covariance = np.linalg.pinv(done.jac.T @ done.jac)
     factors = np.exp(done.x)
+    by = np.zeros(9)
+    by[:3], by[4:7] = screen.mean(0) * factors[:3], lamps.mean(0) * factors[4:7]
+    by[3] = room.mean(0).sum() * factors[3]
+    by /= by.sum()
     return PaperLight(
         given * factors[:3],
         float(factors[3]),
         factors[4:7],
         float(np.sqrt(covariance[:3, :3].mean())),
+        float(np.sqrt(by @ covariance @ by)),
     )
 
 
@@ -677,7 +683,9 @@ def use_paper(
         return lights, tuple(notices)
     off = float(np.mean(free.gain) / np.mean(lights.gain))
     fit = {**lights.fit, "paper_gain": off, "paper_gain_deviation": free.deviation}
-    doubt = fit.get("gain_deviation", 0.0)
+    doubt = math.hypot(
+        fit.get("gain_deviation", 0.0), fit.get("ball_reflectance_deviation", 0.0)
+    )
     agree = abs(math.log(off)) <= SHEET_FIT.gains_differ * math.hypot(free.deviation, doubt)
     saturated = fit.get("saturated", 0) > SCREEN_FIT.saturated
     both = light_on_paper(sheet, lights, doubt) if agree and doubt > 0 else free
@@ -686,7 +694,7 @@ def use_paper(
     by_paper = saturated and both.deviation < (SHEET_FIT.useful if agree else doubt)
     if by_paper or (agree and both.deviation < doubt):
         lights = _with_light(lights, both)
-        fit["gain_deviation"] = both.deviation
+        fit |= {"gain_deviation": both.deviation, "light_deviation": both.light}
         fit["room_raised"] = fit.get("room_raised", 1.0) * float(both.lamps.mean())
     if by_paper:
         text = (

@@ -57,7 +57,7 @@ def observe(photo: Array, lights: Lights, clipped: Mask) -> Observation:
     away = lights.rig.lens_distance(*photo.shape[:2]).astype(np.float32) if lights.fit else None
     return Observation(
         photo, renderer_under(lights), mask, doubt, lights.lamps, exponent, away,
-        lights.fit.get("gain_deviation", 0.0),
+        lights.fit.get("light_deviation", 0.0),
     )  # fmt: skip
 
 

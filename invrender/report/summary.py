@@ -93,20 +93,20 @@ def summarise(
         photos=dict(zip(used, refined.photo_errors, strict=False)),
         versions={n: version(n) for n in PACKAGES},
     )
-    sigma = with_mirror_error(Estimate(maps, deviations(refined.sigma)), lights).sigma
+    sigma = with_light_error(Estimate(maps, deviations(refined.sigma)), lights).sigma
     sigma = {k: resize(v, *photo.shape[:2]) for k, v in sigma.items()}
     found_lights = lights.scaled(*refined.factors[0]) if refined.factors else lights
     return Result(Estimate(refined.maps, sigma), found_lights, photo, report, rendering)
 
 
-def with_mirror_error(estimate: Estimate, lights: Lights) -> Estimate:
-    """The estimate with the error of the albedos that the mirror's reflectance brings.
+def with_light_error(estimate: Estimate, lights: Lights) -> Estimate:
+    """The estimate with the error of the albedos that the light's brings.
 
-    All light is that in the mirror over its reflectance, and albedo is light over light: where the
-    reflectance was measured (``ball_reflectance_deviation``, of its logarithm) albedos are off by
-    as much, beside what they are off by anyway.
+    Albedo is light over light: where the strength of that on the sample is in doubt
+    (``light_deviation``, of its logarithm) albedos are off by as much, beside what they are off by
+    anyway.
     """
-    share = lights.fit.get("ball_reflectance_deviation", 0.0)
+    share = lights.fit.get("light_deviation", 0.0)
     if not share:
         return estimate
     sigma = dict(estimate.sigma)

@@ -14,7 +14,7 @@ from invrender.capture.mirror import make_ball
 from invrender.capture.table import hidden_by_screen, room_irradiance
 from invrender.files.images import Photo
 from invrender.rig import Rig
-from invrender.sphere import directions
+from invrender.sphere import directions, irradiance
 
 RIG, SIZE = Rig(), (720, 960)
 BALL = make_ball(RIG, RIG.ball_centre, RIG.ball_radius, SIZE)
@@ -101,3 +101,31 @@ def test_a_bezel_is_not_the_room():
     hidden = hidden_by_screen(rig, points, d)
     np.testing.assert_array_equal(hidden, hidden_by_screen(larger, points, d))
     assert (hidden & ~hidden_by_screen(RIG, points, d)).any()
+
+
+def test_a_lamp_right_beside_the_screen_is_seen():
+    """Where the screen's light may spread, what is far brighter than the screen is a lamp."""
+    white = np.full(3, 2.0)
+    far = directions(64, 128).astype(float)
+    edge = np.array([RIG.screen_corner[0] + RIG.screen_edges[0][0] + 0.004, 0.0, RIG.screen_height])
+    toward = edge - RIG.ball_centre
+    toward /= np.linalg.norm(toward)
+
+    def room(d):
+        lamp = np.asarray(d @ toward > np.cos(np.radians(2)))
+        return 0.2 + 100.0 * lamp[..., None] * np.ones(3)
+
+    def table(point):
+        return np.full((*point.shape[:-1], 3), 0.1)
+
+    image = photograph(RIG, *SIZE, room, table, np.ones((8, 8, 3)), white)
+    photo = Photo(image.astype(np.float32))
+    light = [
+        irradiance(fill_environment(*unfold_environment(photo, RIG, IMAGE, 64, 1.0, w)), (0, 0, 1))
+        for w in (None, white)
+    ]
+    truth = room(far)
+    truth[32:] = 0
+    true = irradiance(truth, (0, 0, 1))
+    dark, found = (float(np.mean(np.abs(e - true) / true)) for e in light)
+    assert found < 0.2 < dark

@@ -8,7 +8,7 @@ from invrender.maps import Estimate, constant_maps
 from invrender.pattern.default import default_pattern
 from invrender.refine.gauss_newton import Refined
 from invrender.report.notices import map_notices
-from invrender.report.summary import with_mirror_error
+from invrender.report.summary import with_light_error
 from invrender.rig import Rig
 
 
@@ -17,13 +17,13 @@ def test_an_uncertain_mirror_makes_albedos_uncertain(channels):
     maps = constant_maps(4, 5, diffuse=0.5, specular=0.04)
     sigma = {name: np.full((4, 5, *channels), 0.01, np.float32) for name in ("diffuse", "specular")}
     estimate = Estimate(maps, {**sigma, "roughness": np.full((4, 5), 0.1, np.float32)})
-    fit = {"ball_reflectance_deviation": 0.03}
-    wider = with_mirror_error(estimate, Lights(Rig(), default_pattern(8), fit=fit))
+    fit = {"light_deviation": 0.03}
+    wider = with_light_error(estimate, Lights(Rig(), default_pattern(8), fit=fit))
     np.testing.assert_allclose(wider.sigma["diffuse"], np.hypot(0.01, 0.015), rtol=1e-6)
     np.testing.assert_allclose(wider.sigma["specular"], np.hypot(0.01, 0.0012), rtol=1e-6)
     assert wider.sigma["roughness"] is estimate.sigma["roughness"]
-    stated = Lights(Rig(), default_pattern(8), fit={"ball_reflectance_deviation": 0.0})
-    assert with_mirror_error(estimate, stated) is estimate
+    stated = Lights(Rig(), default_pattern(8), fit={"light_deviation": 0.0})
+    assert with_light_error(estimate, stated) is estimate
 
 
 @pytest.mark.parametrize(
