@@ -34,6 +34,7 @@ def unfold_environment(
     mean over a texel that shows nothing else, of which the coverage is nought.
     """
     ball, samples, half = image.ball, UNFOLDING.samples, height // 2
+
     def pool(a: Array) -> Array:
         return a.reshape(half, samples, 2 * height, samples, -1).sum((1, 3))
 
@@ -46,7 +47,10 @@ def unfold_environment(
     free = sample_image(mask, pixels, image.origin) < UNFOLDING.hidden
     light = sample_image(photo.image[image.area], pixels, image.origin) * free[..., None]
     count, lamps = pool(free.astype(np.float32)), np.zeros((half, 2 * height, 1), np.float32)
-    if white is not None and (beside := _lamps_by_screen(photo, rig, image, mask, blur, white)).any():
+    if (
+        white is not None
+        and (beside := _lamps_by_screen(photo, rig, image, mask, blur, white)).any()
+    ):
         shown = sample_image(beside.any(-1).astype(np.float32), pixels, image.origin)
         shown = (shown >= UNFOLDING.lamp_shown) & ~free
         light += sample_image(beside, pixels, image.origin) * shown[..., None]

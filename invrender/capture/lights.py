@@ -250,14 +250,10 @@ def _measure(
         rig = screen.rig
     fit |= _mirror_numbers(capture, rig, ball)
     fit["room_saturated"] = _room_saturated(photo, rig, image)
-    environment, coverage = unfold_environment(
-        photo, rig, image, height, screen.blur, screen.gain
-    )
+    environment, coverage = unfold_environment(photo, rig, image, height, screen.blur, screen.gain)
     seen, environment = environment, fill_environment(environment, coverage)
     filling = environment - seen
-    raised = raise_clipped(
-        photo, rig, image, lit, environment, screen.gain_deviation, screen.blur
-    )
+    raised = raise_clipped(photo, rig, image, lit, environment, screen.gain_deviation, screen.blur)
     environment, lamps, fit["room_raised"] = raised.environment, raised.lamps, raised.factor
     gain = screen.gain * raised.gain
     fit["gain_by_table"] = float(raised.gain.mean())

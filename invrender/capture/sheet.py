@@ -683,9 +683,7 @@ def use_paper(
         return lights, tuple(notices)
     off = float(np.mean(free.gain) / np.mean(lights.gain))
     fit = {**lights.fit, "paper_gain": off, "paper_gain_deviation": free.deviation}
-    doubt = math.hypot(
-        fit.get("gain_deviation", 0.0), fit.get("ball_reflectance_deviation", 0.0)
-    )
+    doubt = math.hypot(fit.get("gain_deviation", 0.0), fit.get("ball_reflectance_deviation", 0.0))
     agree = abs(math.log(off)) <= SHEET_FIT.gains_differ * math.hypot(free.deviation, doubt)
     saturated = fit.get("saturated", 0) > SCREEN_FIT.saturated
     both = light_on_paper(sheet, lights, doubt) if agree and doubt > 0 else free

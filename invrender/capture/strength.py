@@ -25,9 +25,7 @@ CAUSES = {
 }
 
 
-def light_doubts(
-    lights: Lights, filling: Array, screen: float, lamps: float
-) -> dict[str, float]:
+def light_doubts(lights: Lights, filling: Array, screen: float, lamps: float) -> dict[str, float]:
     """By how much, of its logarithm, the light on the sample's middle is in doubt: for `Lights.fit`
     by its cause, but for the ball's reflectance.
 
@@ -43,9 +41,7 @@ def light_doubts(
 
     raised = np.zeros_like(lights.environment) if lights.lamps is None else lights.lamps
     rest = lights.environment - raised
-    by_screen = float(
-        screen_irradiance(lights.rig, middle, lit, TABLE_METER.screen_cells).mean()
-    )
+    by_screen = float(screen_irradiance(lights.rig, middle, lit, TABLE_METER.screen_cells).mean())
     assert lights.coverage is not None
     hidden = rest * (lights.coverage <= 0)[..., None]
     beside = STRENGTH.beside * room(np.maximum(hidden - filling, 0))

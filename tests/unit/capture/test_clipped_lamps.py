@@ -79,7 +79,7 @@ def picture(light, albedo, room=room):
 
 @pytest.mark.parametrize("albedo", [plain_table, textured_table])
 def test_the_table_tells_how_bright_clipped_lamps_are(light, albedo):
-    photo, environment, coverage = picture(light, albedo)
+    photo, environment, _ = picture(light, albedo)
     truth = room(directions(256, 512).astype(float))
     raised, factor, gain, _, _ = raise_clipped(photo, RIG, IMAGE, SCREEN, environment)
     assert (gain == 1).all()
@@ -97,7 +97,7 @@ def test_the_table_tells_how_bright_clipped_lamps_are(light, albedo):
 
 def test_a_channel_just_below_white_is_raised_with_the_others(light):
     """A JPEG's colours are coarse: beside a small lamp one channel may stay below white."""
-    photo, environment, coverage = picture(light, plain_table)
+    photo, environment, _ = picture(light, plain_table)
     image = photo.image.copy()
     image[..., 0] = np.where(image[..., 0] >= LEVEL, 0.97 * LEVEL, image[..., 0])
     found, factor, _, lamps, _ = raise_clipped(
@@ -113,7 +113,7 @@ def test_a_channel_just_below_white_is_raised_with_the_others(light):
 
 @pytest.mark.parametrize("times", [0.6, 1.5])
 def test_the_table_tells_a_gain_that_the_ball_leaves_in_doubt(light, times):
-    photo, environment, coverage = picture(light, plain_table)
+    photo, environment, _ = picture(light, plain_table)
     wrong = PATTERN, GAIN * times, IDEAL
     deviation = 0.2
     _, _, factor, _, _ = raise_clipped(photo, RIG, IMAGE, wrong, environment, deviation)
@@ -133,7 +133,7 @@ def test_a_hidden_lamp_cannot_make_the_screen_dark():
 
 
 def test_nothing_clipped_nothing_raised(light):
-    photo, environment, coverage = picture(light, grey_table)
+    photo, environment, _ = picture(light, grey_table)
     for whole in (replace(photo, clip_level=None), replace(photo, clip_level=2.0)):
         found = raise_clipped(whole, RIG, IMAGE, SCREEN, environment)
         assert found[0] is environment and found[1] == 1 and (found[2] == 1).all()
@@ -162,7 +162,7 @@ def test_the_table_tells_of_a_lamp_behind_the_screen():
 @pytest.mark.parametrize("albedo", [plain_table, grey_table, textured_table])
 def test_no_lamp_behind_the_screen_where_there_is_none(light, albedo):
     """Nor in a JPEG, nor where the table is black."""
-    photo, environment, coverage = picture(light, albedo)
+    photo, environment, _ = picture(light, albedo)
     whole = replace(photo, clip_level=None)
     for some in (whole, photo, replace(whole, image=0 * photo.image)):
         found, times = with_hidden_lamp(some, environment, coverage)
@@ -172,7 +172,7 @@ def test_no_lamp_behind_the_screen_where_there_is_none(light, albedo):
 @pytest.mark.parametrize("table", [0.0, 1e-6, 0.94, 1.0])
 def test_a_table_that_says_nothing_leaves_the_prior(table, light):
     """Black, nearly so, or saturated itself: the factor stays finite and moderate."""
-    photo, environment, coverage = picture(light, grey_table)
+    photo, environment, _ = picture(light, grey_table)
     image = photo.image.copy()
     image[:, :250] = image[:, 390:] = table
     image[:180] = image[300:] = table
