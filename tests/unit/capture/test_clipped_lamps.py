@@ -126,7 +126,7 @@ def test_the_table_tells_a_gain_that_the_ball_leaves_in_doubt(light, times):
 def test_a_hidden_lamp_cannot_make_the_screen_dark():
     """In a JPEG no such lamp is looked for, and light that the screen hides from the table looks
     like a dim screen: the ball's own doubt limits what the table may change."""
-    photo, environment, coverage = picture(table_light(hidden_lamp), plain_table, hidden_lamp)
+    photo, environment, _ = picture(table_light(hidden_lamp), plain_table, hidden_lamp)
     for deviation, most in ((0.11, 0.4), (0.14, 0.5), (0.43, 0.86)):
         found = raise_clipped(photo, RIG, IMAGE, SCREEN, environment, deviation)
         assert abs(np.log(found[2]).mean()) < most
@@ -162,7 +162,7 @@ def test_the_table_tells_of_a_lamp_behind_the_screen():
 @pytest.mark.parametrize("albedo", [plain_table, grey_table, textured_table])
 def test_no_lamp_behind_the_screen_where_there_is_none(light, albedo):
     """Nor in a JPEG, nor where the table is black."""
-    photo, environment, _ = picture(light, albedo)
+    photo, environment, coverage = picture(light, albedo)
     whole = replace(photo, clip_level=None)
     for some in (whole, photo, replace(whole, image=0 * photo.image)):
         found, times = with_hidden_lamp(some, environment, coverage)
