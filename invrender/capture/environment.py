@@ -51,8 +51,8 @@ def unfold_environment(
         white is not None
         and (beside := _lamps_by_screen(photo, rig, image, mask, blur, white)).any()
     ):
-        shown = sample_image(beside.any(-1).astype(np.float32), pixels, image.origin)
-        shown = (shown >= UNFOLDING.lamp_shown) & ~free
+        share = sample_image((beside > 0).any(-1).astype(np.float32), pixels, image.origin)
+        shown = (share >= UNFOLDING.lamp_shown) & ~free
         light += sample_image(beside, pixels, image.origin) * shown[..., None]
         lamps = pool(shown.astype(np.float32))
 
