@@ -51,7 +51,7 @@ def unfold_environment(
         white is not None
         and (beside := _lamps_by_screen(photo, rig, image, mask, blur, white)).any()
     ):
-        share = sample_image((beside > 0).any(-1).astype(np.float32), pixels, image.origin)
+        share = sample_image(np.asarray(beside.max(-1) > 0, np.float32), pixels, image.origin)
         shown = (share >= UNFOLDING.lamp_shown) & ~free
         light += sample_image(beside, pixels, image.origin) * shown[..., None]
         lamps = pool(shown.astype(np.float32))
