@@ -103,20 +103,25 @@ def evened(theta: Array, s: Settings = PLAIN_SETTINGS) -> Array:
     of, least = s.contrast
     plain = (of * mean.mean()) ** 2 + least**2
     noise = min(1.0, plain / float(shared)) ** 2
-    details = _details(uneven, s)
-    texture = _details(np.log(theta[..., D].mean(-1) + s.dark), s)
-    follows = np.average(details * texture, weights=weight)
+    fine, texture = details(uneven, s), texture_details(theta, s)
+    follows = np.average(fine * texture, weights=weight)
     follows /= np.average(texture**2, weights=weight) + TINY
-    kept = s.roughness * details + (1 - s.roughness) * follows * texture
+    kept = s.roughness * fine + (1 - s.roughness) * follows * texture
     theta[..., R] -= weight * (uneven - (1 - noise) * kept)
     theta[..., D] -= noise * weight[..., None] * (theta[..., D] - np.float32(mean))
     return project(theta)
 
 
-def _details(image: Array, s: Settings) -> Array:
-    """An image (H, W) without its wide shades."""
-    wide = gaussian_filter(image, [s.fine * n for n in image.shape])
+def details(image: Array, s: Settings = PLAIN_SETTINGS) -> Array:
+    """An image (H, W) or (H, W, C) without its wide shades."""
+    height, width, *rest = image.shape
+    wide = gaussian_filter(image, [s.fine * height, s.fine * width, *(0 for _ in rest)])
     return np.asarray(image - wide)
+
+
+def texture_details(theta: Array, s: Settings = PLAIN_SETTINGS) -> Array:
+    """Details (H, W) of the logarithm of the albedo of maps θ (H, W, 9)."""
+    return details(np.log(theta[..., D].mean(-1) + s.dark), s)
 
 
 def _mean(image: Array, weight: Array) -> Array:

@@ -10,7 +10,11 @@ A sample knows nothing of the light that falls on it, so k_true follows neither.
 dielectrics together tell δ, by least squares on the differences of neighbouring parts' means, of
 the mean colour and of two across it. How well is told by the texture itself: what it shows of T
 mirrored and turned, in which no δ stands, is the error of δ, and so is what parts of other sizes
-find.
+find. Parts at the edge of another material differ by much and count little (Student's t).
+
+Where a material's roughness goes with its albedo, as that of wet or worn places does, δ is β times
+details of log k, and T makes these stronger under some of the light and weaker under other light.
+So β is found in the same way, of the details of k.
 
 Either the maps are right, or the first network was, whose roughness a correction has changed, or
 neither: three priors of δ, and the photo chooses. That a lobe is narrower than the maps' shows more
@@ -25,6 +29,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from invrender.refine.gauss_newton import Observation, linearise
+from invrender.refine.plain import details, texture_details
 from invrender.refine.priors import Prior
 from invrender.refine.theta import D, N, R, dielectric_share, is_dielectric, project
 from invrender.sampling import centres, resize
@@ -35,7 +40,8 @@ from invrender.types import TINY, Array
 class Settings:
     """Chosen by hand on 66 simulated photographs
     (docs/research-log/2026-11-30-starts-and-the-light-in-the-albedo.md), `wider` on 117
-    (docs/research-log/2026-11-30-roughness-kept-and-found.md)."""
+    (docs/research-log/2026-11-30-roughness-kept-and-found.md), the last four on 128
+    (docs/research-log/2026-11-30-roughness-that-goes-with-the-albedo.md)."""
 
     side: int = 128  # pixels a side that are judged
     parts: tuple[int, ...] = (6, 7, 8, 9, 10)  # a side, whose means are compared
@@ -48,6 +54,10 @@ class Settings:
     near: float = 0.015  # deviation of δ where a start is right
     wider: float = 3.0  # times its error that a δ above nought is off by
     shared_error: float = 0.5  # of a network's squared error that a material shares
+    freedom: float = 4.0  # Student's, of the difference of two parts
+    normal_median: float = 0.455  # of the square of what is normal, over its variance
+    varied: float = 0.08  # deviation of β: of what roughness follows details of log k by
+    varied_error: float = 1.5  # times what is measured of β, its error
 
 
 TEXTURE_SETTINGS = Settings()
@@ -55,11 +65,13 @@ TEXTURE_SETTINGS = Settings()
 
 @dataclass(frozen=True)
 class Measured:
-    """δ, its variance, and T (h, w, 3) of a plane."""
+    """δ, its variance, and T (h, w, 3) of a plane; β and its variance."""
 
     delta: float
     variance: float
     light: Array
+    slope: float = 0.0
+    slope_variance: float = np.inf
 
 
 def without_light(
@@ -90,8 +102,13 @@ def without_light(
     delta, variance = _chosen(measured, 1 / sum(precisions), starts, s.starts)
     light = resize(np.mean([m.light for m in found], 0), *weight.shape)
     theta, total = prior.mean.copy(), prior.expected.copy()
-    theta[..., R] += weight * np.float32(delta)
-    theta[..., D] -= delta * weight[..., None] * light
+    told = [1 / (s.varied_error**2 * m.slope_variance) for m in found]
+    slope = sum(m.slope * p for m, p in zip(found, told, strict=True)) / (
+        sum(told) + 1 / s.varied**2
+    )
+    change = weight * np.float32(delta + slope * texture_details(theta))
+    theta[..., R] += change
+    theta[..., D] -= change[..., None] * light
     left = min(1.0, variance / usual**2)  # of the expected variance
     total[..., R] *= np.sqrt(1 - s.shared_error * (1 - left) * weight)
     return replace(prior, mean=project(theta), total=total)
@@ -132,7 +149,36 @@ def measure_light(
     images = [x[inner] for x in (k, light, room / of)]
     found = np.array([_regress(images, weight[inner], parts, s) for parts in s.parts])
     (delta, variance), scatter = found.mean(0), found[:, 0].var()
-    return Measured(float(delta), float(variance + scatter), light)
+    slope = _follows(k, light, texture_details(theta), weight, inner)
+    return Measured(float(delta), float(variance + scatter), light, *slope)
+
+
+def _follows(
+    k: Array, light: Array, texture: Array, weight: Array, inner: tuple[slice, ...]
+) -> tuple[float, float]:
+    """β and its variance, by images (h, w, 3) of k and T and details of log k (h, w)."""
+    weight, found = weight[inner].ravel(), details(k)[inner]
+    flat = np.stack([np.ones_like(weight), texture[inner].ravel()], 1)
+    inverse = np.linalg.pinv((flat * weight[:, None]).T @ flat)
+
+    def without_texture(image: Array) -> Array:
+        """Colours (pixels, 3) by the root of their weight, without what any light shows of it."""
+        colours = image.reshape(len(weight), -1)
+        left = colours - flat @ (inverse @ (flat.T @ (weight[:, None] * colours)))
+        return np.asarray(np.sqrt(weight)[:, None] * left)
+
+    y = without_texture(found)
+    noise = np.mean(y**2, 0) + TINY
+
+    def seen(t: Array) -> tuple[float, float]:
+        """What T shows: the precision of β, and that times β."""
+        x = without_texture(details(texture[..., None] * (t - t[inner].mean((0, 1))))[inner])
+        return float((x * x / noise).sum()) + TINY, float((x * y / noise).sum())
+
+    precision, product = seen(light)
+    others = [seen(t) for t in _turned(light)]
+    spread = np.mean([b**2 / a for a, b in others])
+    return product / precision, float(max(spread, 1.0) / precision)
 
 
 def _regress(
@@ -152,18 +198,32 @@ def _regress(
     columns = [np.stack(both, 1) for both in zip(*x, strict=True)]
     turned = [[_differences(u, fill) for u in _turned(t @ axis)] for axis in axes]
     noise = [float(each @ each) / max(each.size, 1) + TINY for each in y]
+    trust = [np.ones_like(each) for each in y]
     for _ in range(s.rounds):
         hessian, gradient = np.diag([TINY, 1.0]), np.zeros(2)
-        for each, column, v in zip(y, columns, noise, strict=True):
-            hessian += column.T @ column / v
-            gradient += column.T @ each / v
+        for each, column, v, w in zip(y, columns, noise, trust, strict=True):
+            weighted = (w[:, None] * column).T / v
+            hessian += weighted @ column
+            gradient += weighted @ each
         best = np.linalg.solve(hessian, gradient)
         left = [each - column @ best for each, column in zip(y, columns, strict=True)]
+        trust = [_trust(r, s) for r in left]
         noise = [
-            float(np.mean([(r @ u) ** 2 / (u @ u + TINY) for u in ways])) + TINY
-            for r, ways in zip(left, turned, strict=True)
+            (
+                float(np.mean([(w * r @ u) ** 2 / (u @ u + TINY) for u in ways]))
+                + float(r @ r) / r.size
+            )
+            / 2
+            + TINY
+            for r, w, ways in zip(left, trust, turned, strict=True)
         ]
     return best[0], np.linalg.inv(hessian)[0, 0]
+
+
+def _trust(left: Array, s: Settings) -> Array:
+    """Weights of residuals, by Student's t of the deviation that their median tells."""
+    variance = float(np.median(left**2)) / s.normal_median + TINY
+    return np.asarray((s.freedom + 1) / (s.freedom + left**2 / variance))
 
 
 def _differences(image: Array, fill: Array) -> Array:

@@ -10,6 +10,7 @@ from invrender.maps import constant_maps
 from invrender.pattern.default import default_pattern
 from invrender.refine import texture
 from invrender.refine.gauss_newton import Observation, linearise
+from invrender.refine.plain import texture_details
 from invrender.refine.priors import network_prior
 from invrender.refine.texture import (
     TEXTURE_SETTINGS,
@@ -194,3 +195,18 @@ def test_the_posterior_of_three_starts():
         variance = (p @ (delta - mean) ** 2) / p.sum()
         got = _chosen(measured, deviation**2, starts, odds)
         assert got == pytest.approx((mean, variance), rel=1e-3, abs=1e-6)
+
+
+@pytest.mark.parametrize("slope", [-0.15, 0.0, 0.15])
+def test_roughness_that_goes_with_the_albedo_is_found(renderer, slope):
+    """From maps of even roughness that explain the photo; and none where there is none."""
+    maps = sample((0.2, 0.15, 0.1), 0.5, 0.5)
+    varied = slope * texture_details(to_theta(maps))
+    maps.roughness += varied
+    observation, prior = explained(renderer, maps, -varied)
+    found = found_in([observation], prior).mean[..., R]
+    left = found - found.mean() - varied
+    if slope:
+        assert left.std() < 0.8 * varied.std()
+    else:
+        assert left.std() < 0.01
