@@ -56,7 +56,7 @@ class Settings:
     shared_error: float = 0.5  # of a network's squared error that a material shares
     freedom: float = 4.0  # Student's, of the difference of two parts
     normal_median: float = 0.455  # of the square of what is normal, over its variance
-    varied: float = 0.08  # deviation of β: of what roughness follows details of log k by
+    varied: float = 0.13  # deviation of β, of the mean roughness
     varied_error: float = 1.5  # times what is measured of β, its error
 
 
@@ -103,9 +103,8 @@ def without_light(
     light = resize(np.mean([m.light for m in found], 0), *weight.shape)
     theta, total = prior.mean.copy(), prior.expected.copy()
     told = [1 / (s.varied_error**2 * m.slope_variance) for m in found]
-    slope = sum(m.slope * p for m, p in zip(found, told, strict=True)) / (
-        sum(told) + 1 / s.varied**2
-    )
+    expected = (s.varied * float(np.average(theta[..., R], weights=weight))) ** 2
+    slope = sum(m.slope * p for m, p in zip(found, told, strict=True)) / (sum(told) + 1 / expected)
     change = weight * np.float32(delta + slope * texture_details(theta))
     theta[..., R] += change
     theta[..., D] -= change[..., None] * light
