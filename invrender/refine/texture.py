@@ -176,8 +176,8 @@ def _follows(
 
     precision, product = seen(light)
     others = [seen(t) for t in _turned(light)]
-    spread = np.mean([b**2 / a for a, b in others])
-    return product / precision, float(max(spread, 1.0) / precision)
+    spread = float(np.mean([b**2 / a for a, b in others]))
+    return product / precision, max(spread, 1.0) / precision
 
 
 def _regress(
