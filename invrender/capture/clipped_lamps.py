@@ -16,12 +16,12 @@ from scipy import ndimage, optimize
 from invrender.capture.ball_image import BallImage
 from invrender.capture.environment import unfold_environment
 from invrender.capture.robust import cauchy_residuals, spread
-from invrender.capture.settings import CLIPPED_LAMPS, TABLE_METER
+from invrender.capture.settings import CLIPPED_LAMPS, DISPLAY, TABLE_METER
 from invrender.capture.table import distant_pairs, lit_table, room_irradiance
 from invrender.colour import AXES
 from invrender.files.images import Photo
 from invrender.lights import Device
-from invrender.rig import Rig
+from invrender.rig import Rig, squared_distance
 from invrender.types import TINY, Array, Mask
 
 
@@ -84,15 +84,18 @@ def raise_clipped(
     if not (clipped.any() or doubted):
         return Raised(environment, 1.0, np.ones(3), None, 0.0)
     seen, at, use, lit, room = lit_table(photo, rig, image.ball, screen, environment)
-    factors = _Factors(seen, use, lit, room, room_irradiance(rig, at, clipped))
+    aside = squared_distance(rig.project(at, photo.height, photo.width), photo.height, photo.width)
+    power = photo.curve_deviation / -math.log(DISPLAY.sample)
+    lamplight = room_irradiance(rig, at, clipped)
+    factors = _Factors(seen, use, lit, room, lamplight, aside, power)
     doubt = CLIPPED_LAMPS.gain_doubt * gain_deviation if doubted else 0.0
-    x, y, deviation = factors.fit(doubt)
+    x, y, camera, deviation = factors.fit(doubt)
     if doubted:  # textures, and a lamp that the screen hides, spoil the table's word
-        told = factors.spread(x, y).max() < CLIPPED_LAMPS.plain
+        told = factors.spread(x, y, camera).max() < CLIPPED_LAMPS.plain
         # What is saturated hides how bright it is, not that it is as bright as that.
         least, most = (CLIPPED_LAMPS.likely_gain * d for d in (-gain_deviation, doubt))
         if not (told and least < y.mean() < most):
-            x, y, deviation = factors.fit(0.0)
+            x, y, _, deviation = factors.fit(0.0)
     factor, gain = np.exp(x), np.exp(y)
     raised = environment + clipped * (factor - 1).astype(np.float32)
     lamps = np.minimum(clipped * factor, raised).astype(np.float32) if clipped.any() else None
@@ -103,11 +106,18 @@ class _Factors:
     """Logarithms of the clipped light's factor and of the screen's, (3,) each, by the table.
 
     ``seen``: log radiance of the used blocks (n, 3); irradiance is
-    factor·``lit`` + ``room`` + (factor - 1)·``lamps``.
+    factor·``lit`` + ``room`` + (factor - 1)·``lamps``. What a tone curve leaves, a power of light
+    that deviates from 1 by ``power``, and what the lens loses with the distances ``aside`` (n,) are
+    found as well: else the room's light or the screen's would stand for them.
     """
 
-    def __init__(self, seen: Array, use: Mask, lit: Array, room: Array, lamps: Array) -> None:
+    def __init__(
+        self, seen: Array, use: Mask, lit: Array, room: Array, lamps: Array, aside: Array,
+        power: float,
+    ) -> None:  # fmt: skip
         self.lit, self.room, self.lamps = lit, room, lamps
+        self.aside = aside[:, None] * np.ones(3)
+        self.camera = np.array([max(power, CLIPPED_LAMPS.least_power), CLIPPED_LAMPS.vignetting])
         apart = distant_pairs(use)
         self.pairs = [pair for pair, _ in apart]
         # Textures are alike over several blocks: so many pairs count as one.
@@ -117,51 +127,57 @@ class _Factors:
     def _steps(self, log: Array) -> list[Array]:
         return [(log[i] - log[j]) @ AXES for i, j in self.pairs]
 
-    def errors(self, x: Array, y: Array) -> list[Array]:
-        """Of each lag, (pairs, 3), along `AXES`."""
+    def errors(self, x: Array, y: Array, camera: Array) -> list[Array]:
+        """Of each lag, (pairs, 3), along `AXES`. camera: the power less 1, and the lens's loss."""
         light = np.exp(y) * self.lit + self.room + np.expm1(x) * self.lamps
-        steps = self._steps(np.log(np.maximum(light, TINY)))
+        log = (1 + camera[0]) * np.log(np.maximum(light, TINY)) - camera[1] * self.aside
+        steps = self._steps(log)
         return [w - s for w, s in zip(self.wanted, steps, strict=True)]
 
-    def spread(self, x: Array, y: Array) -> Array:
+    def spread(self, x: Array, y: Array, camera: Array) -> Array:
         """The errors' spread (3,) along `AXES`, the median lag's."""
-        spreads = [np.maximum(spread(e, 0), TABLE_METER.least_spread) for e in self.errors(x, y)]
+        errors = self.errors(x, y, camera)
+        spreads = [np.maximum(spread(e, 0), TABLE_METER.least_spread) for e in errors]
         return np.asarray(np.median(spreads, 0)) if spreads else np.full(3, math.inf)
 
-    def fit(self, doubt: float) -> tuple[Array, Array, float]:
-        """The most probable ones, and the deviation of the clipped light's, the channels' mean; the
-        screen's stays where ``doubt``, its deviation, is 0."""
+    def fit(self, doubt: float) -> tuple[Array, Array, Array, float]:
+        """The most probable ones, what the camera does (2,), and the deviation of the clipped
+        light's, the channels' mean; the screen's stays where ``doubt``, its deviation, is 0."""
         free = np.array([self.lamps.any(), doubt > 0]).repeat(3)
         if not free.any():
-            return np.zeros(3), np.zeros(3), 0.0
+            return np.zeros(3), np.zeros(3), np.zeros(2), 0.0
+        free = np.append(free, [True, True])
 
-        def whole(z: Array) -> tuple[Array, Array]:
-            both = np.zeros(6)
-            both[free] = z
-            return both[:3], both[3:]
+        def whole(z: Array) -> tuple[Array, Array, Array]:
+            every = np.zeros(8)
+            every[free] = z
+            return every[:3], every[3:6], every[6:]
+
+        def start(factor: float) -> Array:
+            return np.repeat([factor, 0.0, 0.0], (3, 3, 2))[free]
 
         def residuals(z: Array, scales: list[Array]) -> Array:
-            x, y = whole(z)
-            parts = []
+            x, y, camera = whole(z)
+            parts = [camera / self.camera]
             if free[0]:
                 parts.append(_about(x, CLIPPED_LAMPS.mean, CLIPPED_LAMPS.deviation,
                                     CLIPPED_LAMPS.channel_deviation))  # fmt: skip
             if free[3]:
                 parts.append(_about(y, 0.0, doubt, doubt * CLIPPED_LAMPS.channel_doubt))
-            for error, scale, weight in zip(self.errors(x, y), scales, self.weights, strict=True):
+            for error, scale, weight in zip(
+                self.errors(x, y, camera), scales, self.weights, strict=True
+            ):
                 parts.append((weight * cauchy_residuals(error / scale)).ravel())
             return np.concatenate(parts)
 
-        least = np.array([0.0, -CLIPPED_LAMPS.greatest]).repeat(3)[free]
-        z = np.array([CLIPPED_LAMPS.mean, 0.0]).repeat(3)[free]
+        least = np.repeat([0.0, -CLIPPED_LAMPS.greatest, -CLIPPED_LAMPS.greatest], (3, 3, 2))[free]
+        z = start(CLIPPED_LAMPS.mean)
         for turn in range(3):
             scales = [
                 np.maximum(spread(e, 0), TABLE_METER.least_spread) for e in self.errors(*whole(z))
             ]
             if turn == 0 and free[0]:  # the Cauchy loss has more than one minimum
-                starts = [
-                    np.array([s, 0.0]).repeat(3)[free] for s in np.linspace(*CLIPPED_LAMPS.starts)
-                ]
+                starts = [start(s) for s in np.linspace(*CLIPPED_LAMPS.starts)]
                 z = min(starts, key=lambda s: float((residuals(s, scales) ** 2).sum()))
             inside = CLIPPED_LAMPS.inside
             z = np.clip(z, least + inside, CLIPPED_LAMPS.greatest - inside)

@@ -556,8 +556,12 @@ class ClippedLamps:
     # Deviation of the log gain from which the screen is measured by the table too; by what that is
     # multiplied where some of the screen is saturated; and of the channels, in that; by hand.
     known_gain: float = 0.1
-    gain_doubt: float = 3.0
+    gain_doubt: float = 1.0
     channel_doubt: float = 0.5
+    # What the camera adds: deviations of the power that a tone curve leaves, at least, and of the
+    # share of light that a corner lacks; phones' JPEGs lack up to 0.15.
+    least_power: float = 0.01
+    vignetting: float = 0.08
     # The table is believed where its errors with another gain are so small, in logarithms; by hand.
     plain: float = 0.06
     likely_gain: float = 2.0  # deviations, in that, by which it may differ; by hand

@@ -52,7 +52,8 @@ class FoundSheet:
     (x, y) the principal point lies from that photo's middle, in its widths; distortion: k1, of
     x·(1 + k1·r²) with r the tangent of the angle from the axis; each with its deviation. residual:
     of the corners, root mean square in pixels. white: (k, 3) places of plain paper, metres, and
-    white_radiance (k, 3) what the photo shows there; white_aside: (k,) their squared distance from
+    white_radiance (k, 3) what the photo shows there, at least, where it is white_saturated (k, 3);
+    white_aside: (k,) their squared distance from
     the optical axis, a corner's being 1. turns: quarters by which the photo was turned,
     counter-clockwise.
     """
@@ -70,6 +71,7 @@ class FoundSheet:
     residual: float
     white: Array
     white_radiance: Array
+    white_saturated: Mask
     white_aside: Array
     turns: int = 0
 
@@ -172,7 +174,9 @@ def use_sheet(capture: Capture) -> tuple[Capture, FoundSheet | None, tuple[Notic
         camera_shift=tuple(shift.tolist()),
         camera_tilt=tuple(tilt.tolist()),
     )
-    white, radiance = _white_radiance(photo, posed, _rotated(sheet.white, lies), sheet.white_side)
+    white, radiance, saturated = _white_radiance(
+        photo, posed, _rotated(sheet.white, lies), sheet.white_side
+    )
     found = FoundSheet(
         ids=ids,
         corners=np.asarray(posed.project(_on_table(places), photo.height, photo.width)),
@@ -187,6 +191,7 @@ def use_sheet(capture: Capture) -> tuple[Capture, FoundSheet | None, tuple[Notic
         residual=residual,
         white=_on_table(white),
         white_radiance=radiance,
+        white_saturated=saturated,
         white_aside=squared_distance(
             posed.project(_on_table(white), photo.height, photo.width), photo.height, photo.width
         ),
@@ -561,9 +566,9 @@ def _on_table(points: Array) -> Array:
 # --- the paper ----------------------------------------------------------------------------------
 
 
-def _white_radiance(photo: Photo, rig: Rig, white: Array, side: float) -> tuple[Array, Array]:
-    """The squares of paper that the photo shows whole and unsaturated: middles (k, 2) and mean
-    radiance (k, 3)."""
+def _white_radiance(photo: Photo, rig: Rig, white: Array, side: float) -> tuple[Array, Array, Mask]:
+    """The squares of paper that the photo shows whole: middles (k, 2), median radiance (k, 3), and
+    where some of that is saturated (k, 3)."""
     count = SHEET_FIT.patch_points
     t = ((np.arange(count) + 0.5) / count - 0.5) * SHEET_FIT.patch_inside * side
     grid = np.stack(np.meshgrid(t, t), -1).reshape(-1, 2)
@@ -573,8 +578,8 @@ def _white_radiance(photo: Photo, rig: Rig, white: Array, side: float) -> tuple[
     use = inside.all(1)
     row, column = row[use], column[use]
     seen = photo.image[row, column]
-    clear = ~photo.clipped[row, column].any(1)
-    return white[use][clear], np.median(seen[clear], 1)
+    level = math.inf if photo.clip_level is None else photo.clip_level
+    return white[use], np.median(seen, 1), (seen >= level).any(1)
 
 
 def undone(sheet: FoundSheet | None, response: Response) -> FoundSheet | None:
@@ -598,15 +603,23 @@ class PaperLight:
     light: float
 
 
+def clear_squares(found: FoundSheet) -> int:
+    """How many squares of paper the photo shows unsaturated."""
+    return int((~found.white_saturated.any(-1)).sum())
+
+
 def light_on_paper(found: FoundSheet, lights: Lights, doubt: float = math.inf) -> PaperLight | None:
     """The most probable screen and room by the light on the paper, which shows both together.
 
     ``lights`` has the pattern, the gain by the ball, of which ``doubt`` is the logarithm's
     deviation (infinite: it is not asked), and the room, whose ``lamps`` are a guess. A factor on
     each, what the lens loses towards the corners and the paper's own reflectance are fitted
-    together, under log-normal priors. None where too little paper is to be seen.
+    together, under log-normal priors. Saturated paper has at least the light that the photo shows:
+    without it, the rest would be taken as all, which lies in shadows. None where too little paper
+    is to be seen.
     """
-    if len(found.white) < SHEET_FIT.least_patches:
+    full = found.white_saturated
+    if clear_squares(found) < SHEET_FIT.least_patches:
         return None
     cells = SHEET_FIT.screen_cells
     guessed = np.zeros_like(lights.environment) if lights.lamps is None else lights.lamps
@@ -629,6 +642,7 @@ def light_on_paper(found: FoundSheet, lights: Lights, doubt: float = math.inf) -
         bright = screen * np.exp(x[:3]) + room * np.exp(x[3]) + lamps * np.exp(x[4:7])
         lens = lens_gain(min(x[8], SHEET_FIT.most_vignetting), found.white_aside)
         off = (bright * np.exp(x[7]) / lens[:, None] - seen) * weight
+        off = np.where(full, np.minimum(off, 0), off)
         # Its square is soft_l1's loss: paper in a shadow may be far off, what is known may not.
         off *= np.sqrt(2 / (1 + np.sqrt(1 + off**2)))
         prior = (

@@ -12,7 +12,7 @@ from invrender.capture.crop import crop_mask, sample_corners
 from invrender.capture.lights import FoundLights
 from invrender.capture.mirror import Ball, horizon_points, mirror_normals, outline_points
 from invrender.capture.settings import SHEET_FIT
-from invrender.capture.sheet import FoundSheet
+from invrender.capture.sheet import FoundSheet, clear_squares
 from invrender.colour import linear_to_srgb
 from invrender.report.advice import advice, pattern_share, sky_shown
 from invrender.rig import Rig
@@ -98,7 +98,7 @@ def _sheet_numbers(sheet: FoundSheet | None) -> dict[str, Any] | None:
         "principal_deviation": list(sheet.principal_deviation),
         "distortion": sheet.distortion,
         "distortion_deviation": sheet.distortion_deviation,
-        "white_squares": len(sheet.white),
+        "white_squares": clear_squares(sheet),
     }
 
 

@@ -115,9 +115,9 @@ def test_a_channel_just_below_white_is_raised_with_the_others(light):
 def test_the_table_tells_a_gain_that_the_ball_leaves_in_doubt(light, times):
     photo, environment, _ = picture(light, plain_table)
     wrong = PATTERN, GAIN * times, IDEAL
-    deviation = 0.2
+    deviation = 0.6
     _, _, factor, _, _ = raise_clipped(photo, RIG, IMAGE, wrong, environment, deviation)
-    assert abs(np.log(factor * times)).max() < 0.5 * abs(np.log(times))
+    assert abs(np.log(factor * times).mean()) < 0.5 * abs(np.log(times))
     # A gain that the ball shows well is not touched.
     _, _, factor, _, _ = raise_clipped(photo, RIG, IMAGE, wrong, environment, 0.01)
     assert (factor == 1).all()

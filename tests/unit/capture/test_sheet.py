@@ -251,11 +251,19 @@ def test_the_paper_tells_the_screens_gain(image):
     assert sure.gain == pytest.approx(0.96 * np.array(GAIN), rel=0.01) and sure.deviation < 0.006
 
 
-def test_saturated_paper_does_not_count(image):
-    clip = float(np.median(image))
+def test_saturated_paper_has_at_least_the_light_that_the_photo_shows(image):
+    """Without it the rest, which is darker, would be taken as all that the screen lights."""
+    _, whole, _ = use_sheet(captured(image))
+    clip = float(np.quantile(whole.white_radiance.max(-1), 0.6))
     used, found, _ = use_sheet(captured(np.minimum(image, clip), clip=clip))
     assert tilt_off(used.rig, HELD) < 0.15
-    assert np.all(found.white_radiance < clip)
+    full = found.white_saturated
+    assert np.all(found.white_radiance[~full] < clip) and 0.2 < full.any(-1).mean() < 0.6
+    dim = Lights(used.rig, default_pattern(64), gain=0.5 * np.array(GAIN))
+    assert light_on_paper(found, dim).gain == pytest.approx(GAIN, rel=0.08)
+    bound = replace(found, white_radiance=np.where(full, 0, found.white_radiance))
+    bright = replace(dim, gain=2 * np.array(GAIN))
+    assert light_on_paper(bound, bright).gain == pytest.approx(GAIN, rel=0.08)
 
 
 def test_the_paper_stands_in_for_a_saturated_ball_and_contradicts_a_wrong_one(image):
