@@ -324,17 +324,14 @@ def _ask_networks(
 def _registered(
     photos: Sequence[Observation], own: Sequence[Sample], crops: Sequence[Sample], mean: Array
 ) -> list[Observation]:
-    """The photos cut out again where maps θ, ``mean``, find them, their factors divided out; sharp,
-    which those that networks are asked about are not, as these know them."""
-    from invrender.refine.registration import factor_image, register
+    """The photos cut out again where maps θ, ``mean``, find them; sharp, which those that networks
+    are asked about are not, as these know them."""
+    from invrender.refine.registration import register
 
-    found, result = register(photos, mean), []
-    for photo, sample, crop, place, factor in zip(
-        photos, own, crops, found.places, found.factors, strict=True
-    ):
+    places, result = register(photos, mean).places, []
+    for photo, sample, crop, place in zip(photos, own, crops, places, strict=True):
         before = np.eye(3) if crop.place is None else crop.place
         again = sample.placed(before @ place, sharp=True)
-        shown = again.photo / factor_image(factor, *again.photo.shape[:2])
         clipped = again.clipped if again.clipped.any() else None
-        result.append(replace(photo, photo=shown, clipped=clipped))
+        result.append(replace(photo, photo=again.photo, clipped=clipped))
     return result
