@@ -33,6 +33,10 @@ MEASURING_PHOTOS = 3  # photos from which these count for more than what network
 # of 69 photographs at most 0.1, of one with its screen's shadow elsewhere 2.1; of a mirror 3.5
 # (docs/research-log/2026-11-30-a-shadow-elsewhere.md).
 CONTRADICTED = 0.5
+# Of a pixel of the screen's image in the ball, by which the screen is misplaced: of 20 photographs
+# with few pixels (50) those of a polished sample had the screen elsewhere by that
+# (docs/research-log/2026-11-30-roughness-that-goes-with-the-albedo.md).
+POSE_ERROR = 0.5
 
 
 @dataclass(frozen=True)
@@ -57,8 +61,17 @@ def observe(photo: Array, lights: Lights, clipped: Mask) -> Observation:
     away = lights.rig.lens_distance(*photo.shape[:2]).astype(np.float32) if lights.fit else None
     return Observation(
         photo, renderer_under(lights), mask, doubt, lights.lamps, exponent, away,
-        lights.fit.get("light_deviation", 0.0),
+        lights.fit.get("light_deviation", 0.0), _pose_deviation(lights),
     )  # fmt: skip
+
+
+def _pose_deviation(lights: Lights) -> float:
+    """Of the directions to the screen's points, radians; nought of lights that are known."""
+    pixels, rig = lights.fit.get("pixels", 0.0), lights.rig
+    if not pixels or not rig.has_screen:
+        return 0.0
+    width, depth = rig.screen_sides
+    return float(POSE_ERROR * np.sqrt(width * depth / pixels) / rig.screen_height)
 
 
 def flat_start(photos: Sequence[Observation], samples: int) -> Initial:

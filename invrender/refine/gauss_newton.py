@@ -50,7 +50,8 @@ class Observation:
     exponent: deviation of the power of light that the photo's values may still be, of a JPEG's tone
     curve. away (H, W): squared distances from the photo's middle, of a corner's, for what a lens
     takes of the light; None where that is known. level: deviation of the logarithm of the screen's
-    radiance by its image in the ball, by which all albedos may be off.
+    radiance by its image in the ball, by which all albedos may be off. pose: deviation of
+    the directions to the screen's points, radians, by the pixels of its image in the ball.
     """
 
     photo: Array
@@ -61,6 +62,7 @@ class Observation:
     exponent: float = 0.0
     away: Array | None = None
     level: float = 0.0
+    pose: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,8 @@ So β is found in the same way, of the details of k.
 
 Either the maps are right, or the first network was, whose roughness a correction has changed, or
 neither: three priors of δ, and the photo chooses. That a lobe is narrower than the maps' shows more
-surely than that it is wider, which half of the photos that say so are wrong about.
+surely than that it is wider, which half of the photos that say so are wrong about; a screen that is
+elsewhere than it was found makes narrow lobes seem wider too.
 """
 
 from __future__ import annotations
@@ -91,8 +92,14 @@ def without_light(
     if not is_dielectric(weight):
         return prior
     found = [measure_light(o, prior.mean, weight, samples, s) for o in observations]
-    times = [1 if m.delta < 0 else s.wider for m in found]
-    precisions = [1 / (t**2 * m.variance + s.doubt**2) for t, m in zip(times, found, strict=True)]
+    rho = float(np.average(prior.mean[..., R], weights=weight))
+    precisions = []
+    for o, m in zip(observations, found, strict=True):
+        variance = m.variance + s.doubt**2
+        if m.delta > 0:  # a screen elsewhere widens the lobe as relief does
+            wider = (rho**4 + o.pose**2) ** 0.25 - rho
+            variance = s.wider**2 * m.variance + s.doubt**2 + wider**2
+        precisions.append(1 / variance)
     measured = sum(m.delta * p for m, p in zip(found, precisions, strict=True)) / sum(precisions)
     usual, back = (
         float(np.average(x, weights=weight))
@@ -103,7 +110,7 @@ def without_light(
     light = resize(np.mean([m.light for m in found], 0), *weight.shape)
     theta, total = prior.mean.copy(), prior.expected.copy()
     told = [1 / (s.varied_error**2 * m.slope_variance) for m in found]
-    expected = (s.varied * float(np.average(theta[..., R], weights=weight))) ** 2
+    expected = (s.varied * rho) ** 2
     slope = sum(m.slope * p for m, p in zip(found, told, strict=True)) / (sum(told) + 1 / expected)
     change = weight * np.float32(delta + slope * texture_details(theta))
     theta[..., R] += change

@@ -177,7 +177,8 @@ def test_a_wider_lobe_is_believed_less(monkeypatch):
     for delta in (0.06, -0.06):
         found = Measured(delta, 0.02**2, np.zeros((SIZE, SIZE, 3), np.float32))
         monkeypatch.setattr(texture, "measure_light", lambda *_, found=found: found)
-        moved.append(abs(float((found_in([None], prior).mean - prior.mean)[..., R].mean())))
+        o = Observation(np.zeros((SIZE, SIZE, 3)), None)
+        moved.append(abs(float((found_in([o], prior).mean - prior.mean)[..., R].mean())))
     assert 0.2 * moved[1] < moved[0] < 0.8 * moved[1]
 
 
@@ -210,3 +211,21 @@ def test_roughness_that_goes_with_the_albedo_is_found(renderer, slope):
         assert left.std() < 0.8 * varied.std()
     else:
         assert left.std() < 0.01
+
+
+def test_a_screen_in_doubt_widens_narrow_lobes_only(monkeypatch):
+    """Of δ above nought, measured with the same error."""
+    moved = {}
+    for rho in (0.15, 0.6):
+        sigma = {k: np.full((SIZE,) * 2, v) for k, v in SIGMA.items()}
+        prior = network_prior(sample(0.2, rho), sigma)
+        for delta in (0.06, -0.06):
+            found = Measured(delta, 0.01**2, np.zeros((SIZE, SIZE, 3), np.float32))
+            monkeypatch.setattr(texture, "measure_light", lambda *_, found=found: found)
+            for pose in (0.0, 0.05):
+                o = Observation(np.zeros((SIZE, SIZE, 3)), None, pose=pose)
+                change = float((found_in([o], prior).mean - prior.mean)[..., R].mean())
+                moved[rho, delta, pose] = abs(change)
+    assert moved[0.15, 0.06, 0.05] < 0.5 * moved[0.15, 0.06, 0.0]
+    assert moved[0.6, 0.06, 0.05] > 0.9 * moved[0.6, 0.06, 0.0]
+    assert moved[0.15, -0.06, 0.05] == moved[0.15, -0.06, 0.0]
