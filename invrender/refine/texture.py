@@ -41,7 +41,7 @@ from invrender.types import TINY, Array
 class Settings:
     """Chosen by hand on 66 simulated photographs
     (docs/research-log/2026-11-30-starts-and-the-light-in-the-albedo.md), `wider` on 117
-    (docs/research-log/2026-11-30-roughness-kept-and-found.md), the last four on 128
+    (docs/research-log/2026-11-30-roughness-kept-and-found.md), the last five on 128
     (docs/research-log/2026-11-30-roughness-that-goes-with-the-albedo.md)."""
 
     side: int = 128  # pixels a side that are judged
@@ -57,7 +57,8 @@ class Settings:
     shared_error: float = 0.5  # of a network's squared error that a material shares
     freedom: float = 4.0  # Student's, of the difference of two parts
     normal_median: float = 0.455  # of the square of what is normal, over its variance
-    varied: float = 0.13  # deviation of β, of the mean roughness
+    varied: float = 0.16  # deviation of β, of the mean roughness
+    matt: float = 0.5  # roughness from which that grows no more
     varied_error: float = 1.5  # times what is measured of β, its error
 
 
@@ -97,7 +98,7 @@ def without_light(
     for o, m in zip(observations, found, strict=True):
         variance = m.variance + s.doubt**2
         if m.delta > 0:  # a screen elsewhere widens the lobe as relief does
-            wider = (rho**4 + o.pose**2) ** 0.25 - rho
+            wider = float(np.sqrt(np.hypot(rho**2, o.pose))) - rho
             variance = s.wider**2 * m.variance + s.doubt**2 + wider**2
         precisions.append(1 / variance)
     measured = sum(m.delta * p for m, p in zip(found, precisions, strict=True)) / sum(precisions)
@@ -110,7 +111,7 @@ def without_light(
     light = resize(np.mean([m.light for m in found], 0), *weight.shape)
     theta, total = prior.mean.copy(), prior.expected.copy()
     told = [1 / (s.varied_error**2 * m.slope_variance) for m in found]
-    expected = (s.varied * rho) ** 2
+    expected = (s.varied * min(rho, s.matt)) ** 2
     slope = sum(m.slope * p for m, p in zip(found, told, strict=True)) / (sum(told) + 1 / expected)
     change = weight * np.float32(delta + slope * texture_details(theta))
     theta[..., R] += change
