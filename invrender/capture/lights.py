@@ -121,13 +121,14 @@ def find_lights(
             text = CURVE_TEXT if response.measured else usual
             mirror = (*mirror, Notice("photo-curve", text))
             sheet = undone(sheet, response)
+        exponent = capture.photo.curve_deviation / -math.log(DISPLAY.sample)
+        lights.fit["curve_exponent"] = exponent
         lights, paper = use_paper(sheet, lights, found)
         photo = without_vignetting(capture.photo, lights.fit["vignetting"])
         lights = _in_rec709(lights, photo.matrix)
         # The rim's tilt is kept only where the square of the sample shows none.
         unseen = sheet is None and found.camera_tilt is not None
         lights.fit["border_unseen"] = float(unseen)
-        lights.fit["curve_exponent"] = photo.curve_deviation / -math.log(DISPLAY.sample)
         photo = without_ball_shade(photo.in_rec709(), lights, found)
         capture = replace(capture, photo=photo)
     if environment is not None:

@@ -297,6 +297,7 @@ class SheetFit:
     patch_inside: float = 0.6  # of its side; by hand
     patch_noise: float = 0.03  # of its radiance; by hand
     least_patches: int = 8  # squares of paper that tell the gain; by hand
+    darker: float = 1.0  # logarithm of the paper's radiance over a sample's, about; by hand
     screen_cells: int = 24  # of the screen, a side; by hand
     environment_rows: int = 32  # by hand
     room_deviation: float = 0.5  # of the room's factor about 1; by hand
@@ -583,7 +584,7 @@ class Strength:
     beside: float = 0.2
     lamps: float = 0.5
     hidden_lamp: float = 0.3  # of a lamp there that the table's shading shows; by hand
-    warned: float = 0.08  # of the logarithm of all light, from which a person is told; by hand
+    warned: float = 0.06  # of the logarithm of all light, from which a person is told; by hand
 
 
 @dataclass(frozen=True)

@@ -706,7 +706,9 @@ def use_paper(
     by_paper = saturated and both.deviation < (SHEET_FIT.useful if agree else doubt)
     if by_paper or (agree and both.deviation < doubt):
         lights = _with_light(lights, both)
-        fit |= {"gain_deviation": both.deviation, "light_deviation": both.light}
+        # What is left of a tone curve lies between the paper and a darker sample.
+        curve = fit.get("curve_exponent", 0.0) * SHEET_FIT.darker
+        fit |= {"gain_deviation": both.deviation, "light_deviation": math.hypot(both.light, curve)}
         fit["room_raised"] = fit.get("room_raised", 1.0) * float(both.lamps.mean())
     if by_paper:
         text = (
