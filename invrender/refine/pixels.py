@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from invrender.refine.flat import PLAIN_ROUGHNESS
 from invrender.refine.gauss_newton import Observation, linearise
 from invrender.refine.priors import channel_correlation
 from invrender.refine.theta import D, N, R, S, project
@@ -49,6 +50,11 @@ class Settings:
     f0_range: tuple[float, float] = (0.08, 0.2)  # surely dielectric; surely metal
     metal_start: float = 0.6  # f0 of a metal of which nothing else is known
     metal_better: float = 0.5  # cost of an area's pixels as metal, over that as dielectric, at most
+    # Of a sample of which nothing is known: what is tried as if it were flat, with slopes of so
+    # little; and the cost, over the least, of what explains the photos about as well.
+    flat_roughness: tuple[float, ...] = (0.06, *PLAIN_ROUGHNESS)
+    flat_slope: float = 0.02
+    about_as_well: float = 1.03
     area: int = 5  # pixels a side of such an area, of `grid`
     correlation: tuple[float, float] = (0.9, 0.95)  # of the colours of k_d, and of k_s
     fixed: float = 0.01  # prior deviation of a roughness that is tried

@@ -28,7 +28,7 @@ import numpy as np
 from scipy import ndimage
 
 from invrender.refine.enlarge import fitting
-from invrender.refine.flat import flat_maps
+from invrender.refine.flat import USUAL_ROUGHNESS, flat_maps
 from invrender.refine.gauss_newton import BAND, Observation, Refined, linearise
 from invrender.refine.pixels import (
     TOGETHER,
@@ -60,16 +60,16 @@ def by_pattern(patterns: Sequence[Array], known: Array) -> list[int]:
 
 def plain_prior(observations: Sequence[Observation], samples: int, s: Settings = TOGETHER) -> Prior:
     """A flat sample's prior, without what networks say: theirs is of a display's light. Its diffuse
-    albedo is the photos' median; but where bare metal explains the photos of an area better by far,
-    it is that."""
+    albedo is the photos' median, its roughness what explains them; but where bare metal explains the
+    photos of an area better by far, it is that."""
     flat = [flat_maps(o.photo, o.renderer, samples) for o in observations]
     theta = to_theta(flat[0])
     theta[..., D] = np.median([f.diffuse for f in flat], 0)
+    photos = [Photo.of(o) for o in observations]
     metal = theta.copy()
     grey = np.maximum(theta[..., D].mean(-1, keepdims=True), TINY)
     metal[..., S] = np.clip(theta[..., D] / grey * s.metal_start, 0, 1)
     metal[..., D] = 0
-    photos = [Photo.of(o) for o in observations]
     costs = []
     for trial in (theta, metal):
         problem = _small(photos, trial, s.roughness, samples, s)
@@ -77,9 +77,22 @@ def plain_prior(observations: Sequence[Observation], samples: int, s: Settings =
         costs.append(ndimage.uniform_filter(cost, s.area, mode="nearest"))
     share = np.asarray(costs[1] < s.metal_better * costs[0], np.float32)
     is_metal = resize(share[..., None], *theta.shape[:2]) > 0.5
+    theta[..., R] = _flat_roughness(photos, theta, samples, s)
     theta = np.where(is_metal, metal, theta).astype(np.float32)
     sigma = wide_deviations(theta, np.full(theta.shape[:2], s.roughness, np.float32), s)
     return Prior(theta, sigma, channel_correlation(*s.correlation))
+
+
+def _flat_roughness(photos: Sequence[Photo], theta: Array, samples: int, s: Settings) -> float:
+    """Of the roughnesses with which a flat sample explains the photos about as well as with any,
+    the commonest: lamps that no pixel mirrors leave a mirror and a matt sample alike."""
+    costs = []
+    for rho in s.flat_roughness:
+        problem = _small(photos, theta, s.fixed, samples, replace(s, slope=s.flat_slope))
+        problem.mean[..., R] = rho
+        costs.append(float(problem.solve(problem.mean, s.tried)[0].cost.mean()))
+    able = np.array(s.flat_roughness)[np.array(costs) <= s.about_as_well * min(costs)]
+    return float(able[np.argmin(np.abs(able - USUAL_ROUGHNESS))])
 
 
 @dataclass
