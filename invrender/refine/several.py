@@ -60,8 +60,8 @@ def by_pattern(patterns: Sequence[Array], known: Array) -> list[int]:
 
 def plain_prior(observations: Sequence[Observation], samples: int, s: Settings = TOGETHER) -> Prior:
     """A flat sample's prior, without what networks say: theirs is of a display's light. Its diffuse
-    albedo is the photos' median, its roughness what explains them; but where bare metal explains the
-    photos of an area better by far, it is that."""
+    albedo is the photos' median, its roughness what explains them; but where bare metal explains
+    the photos of an area better by far, it is that."""
     flat = [flat_maps(o.photo, o.renderer, samples) for o in observations]
     theta = to_theta(flat[0])
     theta[..., D] = np.median([f.diffuse for f in flat], 0)
