@@ -3,8 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import math
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
+from typing import TypeVar
+
+T = TypeVar("T", int, float)
+LEAST, MOST = 1e-9, 1e9  # of radiances: squares stay within single precision
+SEEDS = 2**31 - 1  # the greatest that Mitsuba takes
+SAMPLES = 65_536  # of one pixel, at most: half a minute of a photo at 256²
 
 
 def ball(text: str) -> tuple[float, float, float]:
@@ -17,14 +24,36 @@ def ball(text: str) -> tuple[float, float, float]:
 
 
 def gain(text: str) -> tuple[float, ...]:
-    """One or three positive numbers."""
+    """One or three radiances."""
     try:
         values = tuple(float(v) for v in text.split(","))
     except ValueError:
         values = ()
-    if len(values) not in (1, 3) or not all(0 < v < math.inf for v in values):
-        raise argparse.ArgumentTypeError("expected one or three positive numbers: R,G,B")
+    if len(values) not in (1, 3) or not all(LEAST <= v <= MOST for v in values):
+        limits = f"from {LEAST:g} to {MOST:g}"
+        raise argparse.ArgumentTypeError(f"expected one or three numbers {limits}: R,G,B")
     return values
+
+
+def whole(least: int, most: int) -> Callable[[str], int]:
+    """Reads a whole number between the two."""
+    return _between(int, "a whole number", least, most)
+
+
+def number(least: float, most: float) -> Callable[[str], float]:
+    """Reads a number between the two."""
+    return _between(float, "a number", least, most)
+
+
+def _between(kind: type[T], name: str, least: float, most: float) -> Callable[[str], T]:
+    def read(text: str) -> T:
+        with suppress(ValueError):
+            value = kind(text)
+            if least <= value <= most:
+                return value
+        raise argparse.ArgumentTypeError(f"expected {name} from {least:.10g} to {most:.10g}")
+
+    return read
 
 
 def capture(text: str) -> Path:

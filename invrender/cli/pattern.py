@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from invrender.cli import arguments
+
 if TYPE_CHECKING:
     from rich.console import Console
 
@@ -54,7 +56,8 @@ def add_parser(commands: Any) -> None:
         help="search for the best pattern of a rig instead of taking the default (about a minute)",
     )
     parser.add_argument("--rig", type=Path, help="rig.toml, for the sizes (the default rig)")
-    parser.add_argument("--seed", type=int, default=0, help="of the search (0)")
+    seed = arguments.whole(0, arguments.SEEDS)
+    parser.add_argument("--seed", type=seed, default=0, help="of the search (0)")
     parser.set_defaults(run=run)
 
 

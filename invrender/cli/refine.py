@@ -42,7 +42,10 @@ def add_parser(commands: Any) -> None:
         help="where refinement starts: the network's maps (default), or a flat sample's",
     )
     parser.add_argument(
-        "--samples", type=int, default=64, help="samples a pixel of the specular lobe (64)"
+        "--samples",
+        type=arguments.whole(1, arguments.SAMPLES),
+        default=64,
+        help="samples a pixel of the specular lobe (64)",
     )
     parser.add_argument(
         "--ball",

@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from invrender.cli import arguments
+
 if TYPE_CHECKING:
     from rich.console import Console
 
@@ -21,18 +23,23 @@ def add_parser(commands: Any) -> None:
         description="Path-trace a whole photograph (sample, mirror ball, table) of a material "
         "under the pattern, and write it as a capture folder.",
     )
+    light = arguments.number(0, arguments.MOST)
+    seed = arguments.whole(0, arguments.SEEDS)
+    samples = arguments.whole(1, arguments.SAMPLES)
     parser.add_argument("-o", "--out", type=Path, required=True, help="new folder to write")
     parser.add_argument("--maps", type=Path, help="folder with a material's maps")
     parser.add_argument("--kind", help="procedural material instead, e.g. bricks or rusty_metal")
     parser.add_argument("--environment", type=Path, help="equirectangular EXR or HDR file")
     parser.add_argument("--pattern", type=Path, help="pattern image (the default one)")
-    parser.add_argument("--irradiance", type=float, default=0.5, help="of the room (0.5)")
-    parser.add_argument("--gain", type=float, default=2.0, help="radiance of white (2)")
+    parser.add_argument("--irradiance", type=light, default=0.5, help="of the room (0.5)")
+    parser.add_argument("--gain", type=light, default=2.0, help="radiance of white (2)")
     parser.add_argument("--size", type=int, default=256, help="pixels a side of the maps (256)")
     parser.add_argument("--width", type=int, default=1280, help="of the photo, pixels (1280)")
-    parser.add_argument("--spp", type=int, default=64, help="path tracer's samples (64)")
-    parser.add_argument("--noise", type=float, default=0.005, help="of the sensor (0.005)")
-    parser.add_argument("--seed", type=int, default=0, help="of everything random (0)")
+    parser.add_argument("--spp", type=samples, default=64, help="path tracer's samples (64)")
+    parser.add_argument(
+        "--noise", type=arguments.number(0, 1), default=0.005, help="of the sensor (0.005)"
+    )
+    parser.add_argument("--seed", type=seed, default=0, help="of everything random (0)")
     parser.add_argument(
         "--displaced", action="store_true", help="a surface with heights, not with normals alone"
     )

@@ -176,7 +176,8 @@ def _reader(path: Path, head: bytes) -> Callable[[Path], Raster]:
 
 def _read(path: Path) -> Raster:
     if not path.is_file():
-        raise InputError(f"{path} does not exist")
+        why = "is a folder, not an image" if path.is_dir() else "does not exist"
+        raise InputError(f"{path} {why}")
     try:
         with open(path, "rb") as f:
             head = f.read(64)

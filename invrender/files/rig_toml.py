@@ -69,6 +69,8 @@ def read_rig(path: Path, *, fov: float | None = None) -> RigFile:
     Raises `InputError` for a missing file, bad TOML, unknown or missing keys, wrong types or sizes.
     """
     table = _table(path)
+    if not table:
+        raise InputError(f"{path} is empty: `invrender pattern --device TABLET` writes one")
 
     values: dict[str, Any] = {}
     files: dict[str, str] = {}
@@ -96,11 +98,11 @@ def read_rig(path: Path, *, fov: float | None = None) -> RigFile:
                 else:
                     values[name] = _number(path, what, value, name in _VECTORS)
             else:
-                known = sorted(
-                    {k for s, k in [*_KEYS, *_FILES, *(("device", d) for d in _DEVICE_FIELDS)]
-                     if s == section}
-                )  # fmt: skip
-                hint = f"known keys: {', '.join(known)}" if known else "no such section"
+                names = [*_KEYS, *_FILES, *(("device", d) for d in _DEVICE_FIELDS)]
+                known = sorted({k for s, k in names if s == section})
+                sections = ", ".join(sorted({s for s, _ in names}))
+                hint = f"no such section; known are {sections}"
+                hint = f"known keys: {', '.join(known)}" if known else hint
                 raise InputError(f"{path}: unknown key {key!r} in section {section!r} ({hint})")
     alone = not {"screen", "pattern", "device"} & table.keys()
     for section, key in _REQUIRED_ALONE if alone else _REQUIRED:

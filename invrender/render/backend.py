@@ -18,6 +18,7 @@ import sys
 from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 from invrender.types import InputError
 
@@ -152,7 +153,17 @@ else:
 Float = ad.Float
 UInt = ad.UInt32
 
-__all__ = ["BACKEND", "Float", "UInt", "ad", "dr", "vector"]
+__all__ = ["BACKEND", "Float", "UInt", "ad", "dr", "vector", "while_loop"]
+
+
+def while_loop(state: tuple[Any, ...], *args: Any, **options: Any) -> tuple[Any, ...]:
+    """`drjit.while_loop`, of which Ctrl-C stays a KeyboardInterrupt instead of an error."""
+    try:
+        return tuple(dr.while_loop(state, *args, **options))
+    except RuntimeError as error:
+        if isinstance(error.__cause__, KeyboardInterrupt):
+            raise KeyboardInterrupt from error
+        raise
 
 
 def vector(scalar: type, size: int) -> type:

@@ -6,6 +6,7 @@ they and the sample exchange. The sample's BSDF is a plugin that calls `invrende
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,8 @@ SAMPLE_LIFT = 1e-4
 UP = np.array([0, 0, 1], np.float32)
 # With a lamp: of the spp, the samples of the ball's window, which reaches so many of its radii.
 LAMP_FACTOR, BALL_WINDOW = 16, 1.3
+# Samples of an image at once, some seconds of two processors; and how far the next ones' seed is.
+AT_ONCE, SEED_STEP = 80e6, 100_003
 
 
 class CookTorrance(mi.BSDF):
@@ -523,7 +526,7 @@ def photograph(
         **_lights(rig, pattern, environment, gain, device),
         **_lamp(lamp),
     }
-    photo = np.array(mi.render(mi.load_dict(described), spp=spp, seed=seed))
+    photo = _traced(described, spp, seed)
     if lamp is not None:  # its image in the ball is small
         x, y = rig.project(described["ball"]["center"], height, width)
         reach = BALL_WINDOW * rig.focal(width) * rig.ball_radius / camera[2]
@@ -534,6 +537,17 @@ def photograph(
                     "crop_height": y1 - y0}  # fmt: skip
             sensor = described["sensor"]
             described["sensor"] = {**sensor, "film": {**sensor["film"], **crop}}
-            part = mi.render(mi.load_dict(described), spp=LAMP_FACTOR * spp, seed=seed)
-            photo[y0:y1, x0:x1] = np.array(part)
+            photo[y0:y1, x0:x1] = _traced(described, LAMP_FACTOR * spp, seed)
     return photo
+
+
+def _traced(described: dict[str, Any], spp: int, seed: int) -> Array:
+    """The scene's image, of `AT_ONCE` samples at a time: a Ctrl-C waits until Mitsuba is done."""
+    scene, size = mi.load_dict(described), described["sensor"]["film"]
+    pixels = size.get("crop_width", size["width"]) * size.get("crop_height", size["height"])
+    parts = math.ceil(pixels * spp / AT_ONCE)
+    images = (
+        mi.render(scene, spp=math.ceil(spp / parts), seed=seed + k * SEED_STEP)
+        for k in range(parts)
+    )
+    return np.mean([np.array(image) for image in images], 0)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from invrender.render import brdf
-from invrender.render.backend import dr
+from invrender.render.backend import dr, while_loop
 
 
 @dataclass
@@ -94,7 +94,7 @@ class Sums:
 
         step = len(targets)
         zero = dr.zeros(type(self.rows[0][0]), self.width)
-        out = dr.while_loop(
+        out = while_loop(
             (first + dr.zeros(uint, self.width), *(zero for _ in range(step * len(self.rows)))),
             lambda i, *_: i < count,
             body,

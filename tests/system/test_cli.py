@@ -136,6 +136,21 @@ def test_bad_arguments(capture, tmp_path, capsys):
     assert not out.exists()
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        "refine example --samples 0", "refine example --samples 1.5", "refine example --gain 1e30",
+        "refine example --gain nan", "simulate --irradiance nan", "simulate --noise -1",
+        "simulate --gain inf", "simulate --seed -1", "simulate --spp 0", "pattern --seed -1",
+    ],
+)  # fmt: skip
+def test_numbers_out_of_range_are_refused(words, tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main([*words.split(), "-o", str(tmp_path / "out")])
+    assert stop.value.code == 2 and " from " in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 def test_simulate_writes_what_refine_reads(tmp_path, capsys):
     folder = tmp_path / "new"
     command = ["simulate", "-o", str(folder), "--kind", "plastic", "--size", "64"]

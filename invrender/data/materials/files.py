@@ -72,6 +72,8 @@ def _words(path: Path) -> list[str]:
 def _role(path: Path) -> tuple[str, str, bool]:
     """(role of a file or "", "gl", "dx" or "" where a normal map's name is silent, one letter)."""
     words = _words(path)
+    if words[0] == "sigma":  # a result's expected error of that map
+        return "", "", False
     handed = ""
     if words[-1] in _GL | _DX:
         handed = "gl" if words[-1] in _GL else "dx"
@@ -154,6 +156,9 @@ def read_material(folder: Path, max_size: int = 4096) -> Maps:
         scale = max(h, w) / max_size
         return resize_maps(maps, round(h / scale), round(w / scale)) if scale > 1 else maps
     files = material_files(folder)
+    missing = [n for n in NAMES if n not in files]
+    if missing and (folder / "report.json").is_file():
+        raise InputError(f"{folder} is a result without its {missing[0]} map: refine again")
     for role, alternatives in (
         ("colour", ("basecolor", "diffuse")),
         ("normal", ("normal",)),

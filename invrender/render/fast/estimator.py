@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import Any
 
 from invrender.render import brdf
-from invrender.render.backend import dr, vector
+from invrender.render.backend import dr, vector, while_loop
 from invrender.render.fast.irradiance import screen_cell
 from invrender.render.fast.lamps import LAMP_SIDES, MAX_HOT
 from invrender.render.fast.pyramid import disc_direction
@@ -149,7 +149,7 @@ def _add_lamps(
         return lamp + 1, near | dr.select(side_of(lamp) == 0, bit, 0)
 
     narrow = dr.select(lamps.may_need_samples(alpha, samples), count, 0)
-    _, near = dr.while_loop(
+    _, near = while_loop(
         (dr.zeros(uint, sums.width), dr.zeros(word, sums.width)),
         lambda lamp, _: lamp < narrow,
         mark,

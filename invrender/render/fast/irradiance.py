@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from invrender.render.backend import dr, vector
+from invrender.render.backend import dr, vector, while_loop
 from invrender.render.fast.pyramid import Pyramid, disc, disc_direction, disc_level, level_offset
 from invrender.render.scene import Scene, dimming
 
@@ -53,7 +53,7 @@ class SkyIrradiance:
             cos = dr.maximum(dr.dot(normal, d), 0)
             return column + 1, total + cos * vec3(radiance.x, radiance.y, radiance.z)
 
-        _, total = dr.while_loop(
+        _, total = while_loop(
             (dr.zeros(uint, len(lane)), dr.zeros(vec3, len(lane))),
             lambda column, _: column < dr.opaque(uint, m),
             body,

@@ -27,7 +27,7 @@ from invrender.data.materials.noise import Canvas, noise
 from invrender.data.materials.patterns import WEAVES, bricks, voronoi, weave
 from invrender.files.maps import write_maps
 from invrender.files.write import write_exr
-from invrender.maps import Maps, constant_maps, resize_maps, rotate_maps, turn_maps
+from invrender.maps import NAMES, Maps, constant_maps, resize_maps, rotate_maps, turn_maps
 from invrender.types import InputError
 
 FIELDS = ("diffuse", "specular", "roughness", "normal")
@@ -411,6 +411,23 @@ def test_our_own_files(tmp_path):
     for name in FIELDS:
         assert np.allclose(getattr(maps, name), getattr(truth, name), atol=1e-5)
     assert read_material(tmp_path, max_size=8).shape == (8, 8)
+
+
+def test_a_results_expected_errors_are_no_maps(tmp_path):
+    maps = procedural_material(5, 16, 16, kind="plastic")
+    write_maps(tmp_path, maps)
+    for name in NAMES:
+        write_exr(tmp_path / f"sigma_{name}.exr", np.full((16, 16, 3), 0.01))
+    (tmp_path / "roughness.exr").unlink()
+    with pytest.raises(InputError, match="no roughness map"):
+        read_material(tmp_path)
+    save(tmp_path / "roughness.png", maps.roughness)
+    np.testing.assert_allclose(read_material(tmp_path).roughness, maps.roughness, atol=0.01)
+    # Without its specular map a result would pass for a dielectric.
+    (tmp_path / "report.json").write_text("{}")
+    (tmp_path / "specular.exr").unlink()
+    with pytest.raises(InputError, match="without its specular map"):
+        read_material(tmp_path)
 
 
 def test_opengl_is_preferred_where_both_exist(tmp_path):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from invrender.render.backend import find_llvm
+from invrender.render.backend import UInt, find_llvm, while_loop
 
 
 def tree(root: Path, *files: str) -> None:
@@ -108,3 +108,21 @@ def test_a_path_without_a_file_is_named(tmp_path):
     if "cuda" in done.stdout:
         pytest.skip("runs on a GPU")
     assert "DRJIT_LIBLLVM_PATH names no file" in done.stderr
+
+
+def test_ctrl_c_in_a_loop_stays_one():
+    """Dr.Jit makes errors of what is raised while it records a loop's body."""
+
+    def interrupted(i):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        while_loop((UInt(0),), lambda i: i < 3, interrupted)
+
+    def wrong(i):
+        raise ValueError("wrong")
+
+    with pytest.raises(RuntimeError):
+        while_loop((UInt(0),), lambda i: i < 3, wrong)
+    (last,) = while_loop((UInt(0),), lambda i: i < 3, lambda i: (i + 1,))
+    assert last[0] == 3
