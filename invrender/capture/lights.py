@@ -26,6 +26,7 @@ from invrender.capture.response import Response
 from invrender.capture.screen import Screen, fit_screen
 from invrender.capture.settings import (
     DISPLAY,
+    EXPOSURE,
     MIRRORED_TABLE,
     PATTERN_CHECK,
     SCREEN_FIT,
@@ -108,7 +109,10 @@ def find_lights(
     with threadpool_limits(1, "blas"):
         if capture.fov_from == "unknown":
             capture, fov_notices = measure_fov(capture, ball)
-        capture, found, turned = find_ball_and_orientation(capture, ball)
+        try:
+            capture, found, turned = find_ball_and_orientation(capture, ball)
+        except InputError as error:
+            raise InputError(f"{error}{_fault_of(capture.photo)}") from None
         seen = capture
         capture, mirror = use_reflectance(seen, found)
         lights, response = _measure(capture, found)
@@ -140,6 +144,18 @@ def find_lights(
         *light_warnings(lights), *strength_warnings(lights.fit),
     )  # fmt: skip
     return FoundLights(capture, lights, found, notices, sheet)
+
+
+def _fault_of(photo: Photo) -> str:
+    """What is wrong with a whole photo, to be added to what cannot be found in it."""
+    brightest = photo.image.max(-1)
+    if photo.clipped.mean() > EXPOSURE.saturated:
+        return "; much of the photo is saturated: expose it shorter"
+    if photo.clip_level and np.median(brightest) < EXPOSURE.dark * photo.clip_level:
+        return "; the photo is almost black: expose it longer"
+    if np.ptp(photo.image, -1).max() < EXPOSURE.grey * brightest.max():
+        return "; the photo is grey: the pattern is recognised by its colours"
+    return ""
 
 
 def _in_rec709(lights: Lights, matrix: Array | None) -> Lights:

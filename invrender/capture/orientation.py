@@ -239,8 +239,8 @@ def _notices(turns: int, quarter: int, mirrored: bool) -> tuple[Notice, ...]:
     if quarter or mirrored:
         how = " and ".join(["mirrored"] * mirrored + [f"turned by {90 * quarter}°"] * bool(quarter))
         text = (
-            f"the display shows the pattern {how}; it was taken as shown, but show it as "
-            "'invrender pattern -o FILE.html' does"
+            f"the display shows the pattern {how}; it was taken as shown, but the networks know it "
+            "only as 'invrender pattern -o FILE.html' shows it, and the maps are worse"
         )
         notices.append(Notice("pattern-turned", text))
     return tuple(notices)

@@ -311,6 +311,15 @@ class SheetFit:
 
 
 @dataclass(frozen=True)
+class Exposure:
+    """What is wrong with a photo in which no ball or pattern is found; by hand."""
+
+    saturated: float = 0.3  # share of its pixels
+    dark: float = 0.004  # median over white: one step of 8 bits
+    grey: float = 1e-3  # greatest difference of channels over the brightest value
+
+
+@dataclass(frozen=True)
 class Orientation:
     """Which way round photo and pattern are: `invrender.capture.orientation`."""
 
@@ -676,6 +685,7 @@ MIRRORED_TABLE = MirroredTable()
 RIM_FIT = RimFit()
 SQUARE_FIT = SquareFit()
 SHEET_FIT = SheetFit()
+EXPOSURE = Exposure()
 ORIENTATION = Orientation()
 WHICH_PATTERN = WhichPattern()
 BALL_SHAPE = BallShape()

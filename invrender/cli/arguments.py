@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import TypeVar
 
 T = TypeVar("T", int, float)
-LEAST, MOST = 1e-9, 1e9  # of radiances: squares stay within single precision
-SEEDS = 2**31 - 1  # the greatest that Mitsuba takes
-SAMPLES = 65_536  # of one pixel, at most: half a minute of a photo at 256²
+DIMMEST, LIGHTEST = 1e-9, 1e9  # of radiances: squares stay within single precision
+GREATEST_SEED = 2**31 - 1  # the greatest that Mitsuba takes
+GREATEST_SAMPLES = 65_536  # of one pixel, at most: half a minute of a photo at 256²
 
 
 def ball(text: str) -> tuple[float, float, float]:
@@ -29,8 +29,8 @@ def gain(text: str) -> tuple[float, ...]:
         values = tuple(float(v) for v in text.split(","))
     except ValueError:
         values = ()
-    if len(values) not in (1, 3) or not all(LEAST <= v <= MOST for v in values):
-        limits = f"from {LEAST:g} to {MOST:g}"
+    if len(values) not in (1, 3) or not all(DIMMEST <= v <= LIGHTEST for v in values):
+        limits = f"from {DIMMEST:g} to {LIGHTEST:g}"
         raise argparse.ArgumentTypeError(f"expected one or three numbers {limits}: R,G,B")
     return values
 

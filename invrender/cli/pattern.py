@@ -56,7 +56,7 @@ def add_parser(commands: Any) -> None:
         help="search for the best pattern of a rig instead of taking the default (about a minute)",
     )
     parser.add_argument("--rig", type=Path, help="rig.toml, for the sizes (the default rig)")
-    seed = arguments.whole(0, arguments.SEEDS)
+    seed = arguments.whole(0, arguments.GREATEST_SEED)
     parser.add_argument("--seed", type=seed, default=0, help="of the search (0)")
     parser.set_defaults(run=run)
 

@@ -43,7 +43,7 @@ def add_parser(commands: Any) -> None:
     )
     parser.add_argument(
         "--samples",
-        type=arguments.whole(1, arguments.SAMPLES),
+        type=arguments.whole(1, arguments.GREATEST_SAMPLES),
         default=64,
         help="samples a pixel of the specular lobe (64)",
     )

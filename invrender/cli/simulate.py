@@ -23,9 +23,9 @@ def add_parser(commands: Any) -> None:
         description="Path-trace a whole photograph (sample, mirror ball, table) of a material "
         "under the pattern, and write it as a capture folder.",
     )
-    light = arguments.number(0, arguments.MOST)
-    seed = arguments.whole(0, arguments.SEEDS)
-    samples = arguments.whole(1, arguments.SAMPLES)
+    light = arguments.number(0, arguments.LIGHTEST)
+    seed = arguments.whole(0, arguments.GREATEST_SEED)
+    samples = arguments.whole(1, arguments.GREATEST_SAMPLES)
     parser.add_argument("-o", "--out", type=Path, required=True, help="new folder to write")
     parser.add_argument("--maps", type=Path, help="folder with a material's maps")
     parser.add_argument("--kind", help="procedural material instead, e.g. bricks or rusty_metal")

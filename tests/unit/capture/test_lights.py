@@ -11,7 +11,7 @@ from invrender.capture.ball import find_ball
 from invrender.capture.ball_image import trace_ball
 from invrender.capture.crop import crop_part, crop_sample
 from invrender.capture.environment import fill_environment
-from invrender.capture.lights import level_table, measure_lights
+from invrender.capture.lights import find_lights, level_table, measure_lights
 from invrender.capture.mirror import (
     horizon_points,
     make_ball,
@@ -145,6 +145,22 @@ def test_ball_is_found_in_damaged_photos(clean, tmp_path, damage):
     ball = find_ball(photo, RIG)
     assert max(off(ball, true_ball())) < 0.02
     assert ball.confidence > BALL_SEARCH.least_confidence
+
+
+@pytest.mark.parametrize(
+    ("level", "why"), [(0.0005, "expose it longer"), (1.2, "expose it shorter"), (0.5, "is grey")]
+)
+def test_a_photo_that_shows_nothing_is_told_why(level, why, monkeypatch):
+    """The search itself is not what is tested."""
+    noise = np.random.default_rng(0).uniform(0.9, 1, (*SIZE, 1))
+    photo = Photo(np.repeat(np.minimum(level * noise, 1), 3, -1).astype(np.float32), 1.0)
+
+    def nothing(capture, ball):
+        raise InputError("no mirror ball found")
+
+    monkeypatch.setattr("invrender.capture.lights.find_ball_and_orientation", nothing)
+    with pytest.raises(InputError, match=f"no mirror ball found; .*{why}"):
+        find_lights(Capture(photo, RIG, PATTERN))
 
 
 @pytest.mark.parametrize(
