@@ -225,12 +225,14 @@ def use_reflectance(capture: Capture, ball: Ball) -> tuple[Capture, tuple[Notice
             "it"
         )
         return capture, (Notice("ball-reflectance-doubtful", text),)
+    capture = replace(capture, rig=replace(capture.rig, ball_reflectance=measured))
+    if agrees(nominal, measured, deviation):
+        return capture, ()
     text = (
         f"the ball reflects {found}, by the table in it, and albedo scales with that: set [ball] "
         "reflectance in rig.toml if you know it better"
     )
-    rig = replace(capture.rig, ball_reflectance=measured)
-    return replace(capture, rig=rig), (Notice("ball-reflectance-measured", text),)
+    return capture, (Notice("ball-reflectance-measured", text),)
 
 
 def measure_lights(capture: Capture, ball: Ball, height: int = UNFOLDING.height) -> Lights:
