@@ -94,8 +94,6 @@ def run(args: argparse.Namespace, console: Console) -> int:
         raise InputError("--ppi is for .png and .html")
     if args.size is not None and (real or suffix == ".pdf"):
         raise InputError("--size is for images without --ppi; real sizes are those of the rig")
-    if args.seed < 0:
-        raise InputError("the seed must not be negative")
     if not args.out.resolve().parent.is_dir():
         raise InputError(f"{args.out.parent} is not a folder")
     check_output(args.out, [args.rig] if args.rig else [], file=True)

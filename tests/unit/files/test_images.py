@@ -168,7 +168,7 @@ def refused(path: Path, match: str) -> None:
 
 def test_refusals(tmp_path, monkeypatch):
     refused(tmp_path / "none.png", "does not exist")
-    refused(tmp_path, "does not exist")
+    refused(tmp_path, "is a folder, not an image")
     for name in ("a.png", "a.exr", "a.jpg", "a.tif"):
         (tmp_path / name).write_bytes(b"")
         refused(tmp_path / name, "not a readable")

@@ -226,7 +226,6 @@ def test_command_writes_both_handednesses(tmp_path):
         ("-o", "x.png", "--rig", "rig.toml"),
         ("-o", "x.pdf", "--rig", "missing.toml"),
         ("-o", "x.png", "--optimise", "--rig", "missing.toml"),
-        ("-o", "x.png", "--seed", -1),
     ],
 )
 def test_command_refuses_bad_input(words, tmp_path, monkeypatch):
