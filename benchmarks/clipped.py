@@ -73,10 +73,10 @@ def measure(shot: Shot) -> dict[str, Any] | None:
     level = photo.clip_level / np.asarray(rig.ball_reflectance)
     x = environment / level
     lit = shot.pattern, shot.gain, shot.device
-    raised, factor, *_ = raise_clipped(photo, rig, image, lit, environment)
+    raised = raise_clipped(photo, rig, image, lit, environment)
     results: list[Array] = [
         environment, environment + clipped,
-        x * x.mean(-1, keepdims=True) ** 2, raised,
+        x * x.mean(-1, keepdims=True) ** 2, raised.environment,
     ]  # fmt: skip
     truth = shot.environment.copy()
     truth[len(truth) // 2 :] = 0
@@ -85,7 +85,7 @@ def measure(shot: Shot) -> dict[str, Any] | None:
         return np.array([irradiance(environment, n) for n in NORMALS])
 
     true = light(truth)
-    row: dict[str, Any] = {"photo": shot.name, "factor": factor}
+    row: dict[str, Any] = {"photo": shot.name, "factor": raised.factor}
     for name, result in zip(METHODS, results, strict=True):
         found = light(result.astype(np.float32))
         if name == PAPER:

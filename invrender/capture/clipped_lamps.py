@@ -8,7 +8,7 @@ colours of its own: the brighter the room, the flatter and less coloured the tab
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage, optimize
@@ -49,7 +49,8 @@ def clipped_light(
     return unfold_environment(Photo(light), rig, image, height, blur, white)[0]
 
 
-class Raised(NamedTuple):
+@dataclass(frozen=True)
+class Raised:
     """What `raise_clipped` finds.
 
     environment: (H, 2H, 3), with the clipped texels raised ``factor`` times, in the channels' mean;

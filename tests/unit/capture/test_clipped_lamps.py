@@ -81,8 +81,9 @@ def picture(light, albedo, room=room):
 def test_the_table_tells_how_bright_clipped_lamps_are(light, albedo):
     photo, environment, _ = picture(light, albedo)
     truth = room(directions(256, 512).astype(float))
-    raised, factor, gain, _, _ = raise_clipped(photo, RIG, IMAGE, SCREEN, environment)
-    assert (gain == 1).all()
+    found = raise_clipped(photo, RIG, IMAGE, SCREEN, environment)
+    raised, factor = found.environment, found.factor
+    assert (found.gain == 1).all()
 
     def error(seen):
         each = [[irradiance(e, n) for n in [(0, 0, 1), *TILTED]] for e in (seen, truth)]
@@ -100,12 +101,11 @@ def test_a_channel_just_below_white_is_raised_with_the_others(light):
     photo, environment, _ = picture(light, plain_table)
     image = photo.image.copy()
     image[..., 0] = np.where(image[..., 0] >= LEVEL, 0.97 * LEVEL, image[..., 0])
-    found, factor, _, lamps, _ = raise_clipped(
-        replace(photo, image=image), RIG, IMAGE, SCREEN, environment
-    )
-    whole, wanted, _, _, _ = raise_clipped(photo, RIG, IMAGE, SCREEN, environment)
-    assert abs(factor / wanted - 1) < 0.1
-    rise, rise_wanted = ((x - environment).sum((0, 1)) for x in (found, whole))
+    part = raise_clipped(replace(photo, image=image), RIG, IMAGE, SCREEN, environment)
+    whole = raise_clipped(photo, RIG, IMAGE, SCREEN, environment)
+    found, lamps = part.environment, part.lamps
+    assert abs(part.factor / whole.factor - 1) < 0.1
+    rise, rise_wanted = ((x - environment).sum((0, 1)) for x in (found, whole.environment))
     np.testing.assert_allclose(rise, rise_wanted, rtol=0.15)
     assert lamps is not None and (lamps <= found).all()
     np.testing.assert_allclose((found - lamps).max(), LEVEL, rtol=0.2)
@@ -116,10 +116,10 @@ def test_the_table_tells_a_gain_that_the_ball_leaves_in_doubt(light, times):
     photo, environment, _ = picture(light, plain_table)
     wrong = PATTERN, GAIN * times, IDEAL
     deviation = 0.6
-    _, _, factor, _, _ = raise_clipped(photo, RIG, IMAGE, wrong, environment, deviation)
+    factor = raise_clipped(photo, RIG, IMAGE, wrong, environment, deviation).gain
     assert abs(np.log(factor * times).mean()) < 0.5 * abs(np.log(times))
     # A gain that the ball shows well is not touched.
-    _, _, factor, _, _ = raise_clipped(photo, RIG, IMAGE, wrong, environment, 0.01)
+    factor = raise_clipped(photo, RIG, IMAGE, wrong, environment, 0.01).gain
     assert (factor == 1).all()
 
 
@@ -129,15 +129,15 @@ def test_a_hidden_lamp_cannot_make_the_screen_dark():
     photo, environment, _ = picture(table_light(hidden_lamp), plain_table, hidden_lamp)
     for deviation, most in ((0.11, 0.4), (0.14, 0.5), (0.43, 0.86)):
         found = raise_clipped(photo, RIG, IMAGE, SCREEN, environment, deviation)
-        assert abs(np.log(found[2]).mean()) < most
+        assert abs(np.log(found.gain).mean()) < most
 
 
 def test_nothing_clipped_nothing_raised(light):
     photo, environment, _ = picture(light, grey_table)
     for whole in (replace(photo, clip_level=None), replace(photo, clip_level=2.0)):
         found = raise_clipped(whole, RIG, IMAGE, SCREEN, environment)
-        assert found[0] is environment and found[1] == 1 and (found[2] == 1).all()
-        assert found[3] is None
+        assert found.environment is environment and found.factor == 1
+        assert (found.gain == 1).all() and found.lamps is None
 
 
 def with_hidden_lamp(photo, filled, coverage):
@@ -177,7 +177,8 @@ def test_a_table_that_says_nothing_leaves_the_prior(table, light):
     image[:, :250] = image[:, 390:] = table
     image[:180] = image[300:] = table
     bad = replace(photo, image=image)
-    raised, factor, _, _, _ = raise_clipped(bad, RIG, IMAGE, SCREEN, environment)
+    found = raise_clipped(bad, RIG, IMAGE, SCREEN, environment)
+    raised, factor = found.environment, found.factor
     assert np.isfinite(raised).all() and 1 <= factor < 500
 
 
