@@ -25,7 +25,7 @@ from invrender.report.report import Report
 from invrender.report.result import Result
 from invrender.report.summary import summarise
 from invrender.sampling import resize
-from invrender.types import Array
+from invrender.types import Array, InputError
 
 if TYPE_CHECKING:  # Dr.Jit compiles where the refinement is imported
     from invrender.refine.estimate import Initial
@@ -174,6 +174,8 @@ def _reconstruct(
     init: str,
     samples: int,
 ) -> Result:
+    if samples < 1:
+        raise InputError("the specular lobe needs at least one sample a pixel")
     start, refined, photos = estimate_maps(crops, stage, init, samples, networks)
     with stage("render"):
         renderer = photos[0].renderer

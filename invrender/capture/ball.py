@@ -28,11 +28,11 @@ from invrender.capture.mirror import (
     on_table,
     place_ball,
 )
+from invrender.capture.response import curve_exponent
 from invrender.capture.robust import spread
 from invrender.capture.settings import (
     BALL_SEARCH,
     BALL_VIEW,
-    DISPLAY,
     FIELD_OF_VIEW,
     MIRRORED_TABLE,
     RIM_FIT,
@@ -225,8 +225,8 @@ def measure_reflectance(photo: Photo, rig: Rig, ball: Ball) -> Ball:
     reflectance, deviation = _measured_reflectance(view, rig, circle)
     if reflectance is None:
         return ball
-    exponent = photo.curve_deviation / -math.log(DISPLAY.sample)
-    deviation = math.hypot(deviation, exponent * float(np.log(reflectance).mean()))
+    by_curve = curve_exponent(photo) * float(np.log(reflectance).mean())
+    deviation = math.hypot(deviation, by_curve)
     return replace(ball, reflectance=reflectance, reflectance_deviation=deviation)
 
 

@@ -15,8 +15,9 @@ from scipy import ndimage, optimize
 
 from invrender.capture.ball_image import BallImage
 from invrender.capture.environment import unfold_environment
+from invrender.capture.response import curve_exponent
 from invrender.capture.robust import cauchy_residuals, spread
-from invrender.capture.settings import CLIPPED_LAMPS, DISPLAY, TABLE_METER
+from invrender.capture.settings import CLIPPED_LAMPS, TABLE_METER
 from invrender.capture.table import distant_pairs, lit_table, room_irradiance
 from invrender.colour import AXES
 from invrender.files.images import Photo
@@ -86,7 +87,7 @@ def raise_clipped(
         return Raised(environment, 1.0, np.ones(3), None, 0.0)
     seen, at, use, lit, room = lit_table(photo, rig, image.ball, screen, environment)
     aside = squared_distance(rig.project(at, photo.height, photo.width), photo.height, photo.width)
-    power = photo.curve_deviation / -math.log(DISPLAY.sample)
+    power = curve_exponent(photo)
     lamplight = room_irradiance(rig, at, clipped)
     factors = _Factors(seen, use, lit, room, lamplight, aside, power)
     doubt = CLIPPED_LAMPS.gain_doubt * gain_deviation if doubted else 0.0

@@ -22,10 +22,9 @@ from invrender.capture.hidden_lamp import add_hidden_lamp
 from invrender.capture.mirror import Ball
 from invrender.capture.near_lamp import find_near_lamp
 from invrender.capture.orientation import find_ball_and_orientation, not_the_pattern
-from invrender.capture.response import Response
+from invrender.capture.response import Response, curve_exponent
 from invrender.capture.screen import Screen, fit_screen
 from invrender.capture.settings import (
-    DISPLAY,
     EXPOSURE,
     MIRRORED_TABLE,
     PATTERN_CHECK,
@@ -125,8 +124,7 @@ def find_lights(
             text = CURVE_TEXT if response.measured else usual
             mirror = (*mirror, Notice("photo-curve", text))
             sheet = undone(sheet, response)
-        exponent = capture.photo.curve_deviation / -math.log(DISPLAY.sample)
-        lights.fit["curve_exponent"] = exponent
+        lights.fit["curve_exponent"] = curve_exponent(capture.photo)
         lights, paper = use_paper(sheet, lights, found)
         photo = without_vignetting(capture.photo, lights.fit["vignetting"])
         lights = _in_rec709(lights, photo.matrix)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from invrender.capture.settings import TONE_CURVE
+from invrender.capture.settings import DISPLAY, TONE_CURVE
 from invrender.files.images import Photo
 from invrender.files.tone_curves import FIXED, KNOTS, curve_prior
 from invrender.sampling import knot_shares
@@ -69,6 +70,12 @@ class Response:
         return replace(
             photo, image=image, clip_level=level, linear=True, curve_deviation=self.deviation
         )
+
+
+def curve_exponent(photo: Photo) -> float:
+    """The deviation of the power to which what is left of a photo's tone curve raises its light:
+    over a sample's distance from white it makes the photo's ``curve_deviation``."""
+    return photo.curve_deviation / -math.log(DISPLAY.sample)
 
 
 def curve_shares(values: Array) -> Array:

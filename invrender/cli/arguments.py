@@ -11,6 +11,7 @@ from typing import TypeVar
 T = TypeVar("T", int, float)
 DIMMEST, LIGHTEST = 1e-9, 1e9  # of radiances: squares stay within single precision
 GREATEST_SEED = 2**31 - 1  # the greatest that Mitsuba takes
+GREATEST_SIDE = 8192  # pixels, of a simulated photo and its maps
 GREATEST_SAMPLES = 65_536  # of one pixel, at most: half a minute of a photo at 256²
 
 

@@ -24,6 +24,8 @@ def add_parser(commands: Any) -> None:
         "under the pattern, and write it as a capture folder.",
     )
     light = arguments.number(0, arguments.LIGHTEST)
+    size = arguments.whole(1, arguments.GREATEST_SIDE)
+    width = arguments.whole(64, arguments.GREATEST_SIDE)
     seed = arguments.whole(0, arguments.GREATEST_SEED)
     samples = arguments.whole(1, arguments.GREATEST_SAMPLES)
     parser.add_argument("-o", "--out", type=Path, required=True, help="new folder to write")
@@ -33,8 +35,8 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--pattern", type=Path, help="pattern image (the default one)")
     parser.add_argument("--irradiance", type=light, default=0.5, help="of the room (0.5)")
     parser.add_argument("--gain", type=light, default=2.0, help="radiance of white (2)")
-    parser.add_argument("--size", type=int, default=256, help="pixels a side of the maps (256)")
-    parser.add_argument("--width", type=int, default=1280, help="of the photo, pixels (1280)")
+    parser.add_argument("--size", type=size, default=256, help="pixels a side of the maps (256)")
+    parser.add_argument("--width", type=width, default=1280, help="of the photo, pixels (1280)")
     parser.add_argument("--spp", type=samples, default=64, help="path tracer's samples (64)")
     parser.add_argument(
         "--noise", type=arguments.number(0, 1), default=0.005, help="of the sensor (0.005)"
@@ -76,8 +78,6 @@ def run(args: argparse.Namespace, console: Console) -> int:
     from invrender.sphere import scale_environment
     from invrender.types import InputError
 
-    if args.size < 1 or args.width < 64 or args.spp < 1:
-        raise InputError("sizes and sample counts must be positive, the photo 64 pixels or wider")
     if args.no_screen and (args.pattern or args.exposures not in (None, 1)):
         raise InputError("--no-screen has neither a pattern nor a bracket of exposures")
     if args.photos is not None and not (args.no_screen and 1 <= args.photos <= MOST_PHOTOS):

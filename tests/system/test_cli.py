@@ -142,6 +142,7 @@ def test_bad_arguments(capture, tmp_path, capsys):
         "refine example --samples 0", "refine example --samples 1.5", "refine example --gain 1e30",
         "refine example --gain nan", "simulate --irradiance nan", "simulate --noise -1",
         "simulate --gain inf", "simulate --seed -1", "simulate --spp 0", "pattern --seed -1",
+        "simulate --size 0", "simulate --size 100000000", "simulate --width 63",
     ],
 )  # fmt: skip
 def test_numbers_out_of_range_are_refused(words, tmp_path, capsys):
