@@ -14,6 +14,7 @@ from torch import Tensor
 
 from invrender.types import InputError
 from nets.batch import PIXELS, Batch, positions
+from nets.training.turn import WAYS, turned
 
 GROUP = 8  # shards that are shuffled together
 CPU = torch.device("cpu")
@@ -92,8 +93,10 @@ def batches(
     rank: int = 0,
     world: int = 1,
     device: torch.device = CPU,
+    turning: float = 0.0,
 ) -> Iterator[Batch]:
     """Endless random crops, from step ``start`` on; each of ``world`` processes gets its own part.
+    A share ``turning`` of the batches is `turned` to any of the eight ways.
 
     An epoch is made of what the folder holds when it begins, so shards may be added meanwhile;
     those that are deleted meanwhile are left out.
@@ -107,6 +110,7 @@ def batches(
             group = [p for p in order[at : at + GROUP] if p.exists()]
             members = rng.permutation(sum(count(p) for p in group))
             corners = rng.random((len(members), 2))
+            ways = rng.integers(WAYS, size=len(members)) * (rng.random(len(members)) < turning)
             captures: Batch = {}
             for k in range(0, len(members) - batch * world + 1, batch * world):
                 step += 1
@@ -117,7 +121,7 @@ def batches(
                 except FileNotFoundError:  # deleted since the group was formed
                     break
                 mine = slice(k + rank * batch, k + (rank + 1) * batch)
-                yield _cut(captures, members[mine], corners[mine], crop)
+                yield turned(_cut(captures, members[mine], corners[mine], crop), int(ways[k]))
         if step == 0:
             raise InputError(f"{folder} holds fewer captures than a batch of {batch * world}")
         epoch += 1

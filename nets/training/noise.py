@@ -29,6 +29,7 @@ MIRROR_ERROR, MIRROR_TINT = 0.03, 0.01
 TONED, SHOULDER_ERROR = 0.3, 0.05  # the share of photos first
 BADLY_TONED, EXPONENT_ERROR = 0.4, 0.12
 VIGNETTED, DARKEST_CORNER = 0.5, 0.2
+TURNED = 0.4  # the share of rooms whose display shows the pattern in any orientation
 
 
 def draw_devices(rng: np.random.Generator) -> tuple[Device, Device]:
@@ -65,7 +66,11 @@ def mirror_error(rng: np.random.Generator) -> Array:
 
 
 def draw_pattern(rng: np.random.Generator, pattern: Array) -> Array:
-    """The pattern as a screen shows it whose curve and white balance the ball showed."""
+    """The pattern as a screen shows it whose curve and white balance the ball showed, at times
+    turned as a tablet may be, or mirrored."""
+    if rng.random() < TURNED:
+        pattern = np.rot90(pattern, int(rng.integers(4)))
+        pattern = pattern[:, ::-1] if rng.random() < 0.5 else pattern
     if rng.random() < 0.6:
         return pattern
     curve = 2.2 ** rng.uniform(-1, 1)

@@ -244,7 +244,9 @@ def train(
     if rank == 0:
         (args.out / "options.json").write_text(json.dumps(vars(args), default=str, indent=1))
         print(f"{'resumed at' if resumed else 'starting from'} step {trainer.step}", flush=True)
-    stream = batches(args.data, args.batch, args.crop, args.seed, trainer.step, rank, world, device)
+    stream = batches(
+        args.data, args.batch, args.crop, args.seed, trainer.step, rank, world, device, args.turning
+    )
     run(trainer, stream, args, {k: Path(v) for k, v in valid.items()}, rank)
     return trainer
 
@@ -345,6 +347,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--rate", type=float, default=1e-3)
     p.add_argument("--last-rate", type=float, default=1e-7)
     p.add_argument("--decay", type=float, default=1e-3, help="weight decay")
+    p.add_argument("--turning", type=float, default=0.5, help="share of batches turned or mirrored")
     p.add_argument("--every", type=int, default=500, help="steps between validations")
     p.add_argument("--seed", type=int, default=0)
     p.add_argument("--threads", type=int, default=0)
