@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.__main__ import names
-from benchmarks.common.tables import RESULTS, bars_table, filled, markdown, read_results
+from benchmarks.common.results import markdown
+from benchmarks.common.tables import RESULTS, bars_table, filled, read_results
 from invrender.types import InputError
 
 ROOT = Path(__file__).parents[1]

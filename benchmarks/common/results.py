@@ -83,6 +83,25 @@ def table(header: list[str], rows: list[list[Any]]) -> Table:
     return {"header": list(header), "rows": [list(row) for row in rows]}
 
 
+def cell(value: Any) -> str:
+    """A number or word as the tables show it: three digits, nothing where there is no value."""
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        if math.isnan(value):
+            return ""
+        return f"{value:.0f}" if 1000 <= abs(value) < 1e6 else f"{value:.3g}"
+    return str(value)
+
+
+def markdown(table: Table) -> str:
+    """A Markdown table."""
+    lines = [table["header"], ["---"] * len(table["header"]), *table["rows"]]
+    return "".join("| " + " | ".join(map(cell, line)) + " |\n" for line in lines)
+
+
 def write_results(
     out: Path, results: dict[str, Any], tables: dict[str, Table] | None = None
 ) -> None:
@@ -91,8 +110,6 @@ def write_results(
     results: ``bars`` (a list of `bar`) and whatever else was measured. tables: by name, what
     ``python -m benchmarks tables`` shows of the results once they are in benchmarks/results.
     """
-    from benchmarks.common.tables import markdown
-
     out.mkdir(parents=True, exist_ok=True)
     words = ["python -m benchmarks", *sys.argv[1:]]
     about = {"command": " ".join(words), "commit": commit(), "machine": machine()}

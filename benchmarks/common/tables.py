@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 from pathlib import Path
 from typing import Any
 
-from benchmarks.common.results import Table, table
+from benchmarks.common.results import Table, markdown, table
 from invrender.data.simulate_setup import ranges_table
 from invrender.types import InputError
 
@@ -17,25 +16,6 @@ OF_THE_CODE = {"simulate/ranges": ranges_table}
 RESULTS = Path(__file__).parents[1] / "results"
 BLOCK = re.compile(r"<!-- (table|number): (.*?) -->(.*?)<!-- end -->", re.DOTALL)
 MARK = re.compile(r"<!-- (?:table|number): .*?-->")
-
-
-def cell(value: Any) -> str:
-    """A number or word as the tables show it: three digits, nothing where there is no value."""
-    if value is None:
-        return ""
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, float):
-        if math.isnan(value):
-            return ""
-        return f"{value:.0f}" if 1000 <= abs(value) < 1e6 else f"{value:.3g}"
-    return str(value)
-
-
-def markdown(table: Table) -> str:
-    """A Markdown table."""
-    lines = [table["header"], ["---"] * len(table["header"]), *table["rows"]]
-    return "".join("| " + " | ".join(map(cell, line)) + " |\n" for line in lines)
 
 
 def bars_table(bars: list[dict[str, Any]]) -> Table:

@@ -1,5 +1,6 @@
-// The page: its state as the server tells it, and the step that the address names.
-import { h, api, toast, go, onChange } from "./ui.js";
+// The page: the step that the address names, kept as the server tells it.
+import { h, toast, go, onChange } from "./ui.js";
+import { state, captureOf, takeIn } from "./state.js";
 import { home } from "./home.js";
 import { rig } from "./rig.js";
 import { tablet } from "./tablet_step.js";
@@ -9,25 +10,7 @@ import { maps } from "./maps.js";
 import { take } from "./take.js";
 
 const STEPS = ["Rig", "Tablet", "Photo", "Maps", "Take away"];
-export const state = { captures: [], profiles: [], profile: null };
 let view = null, shown = null;
-
-const saved = { get: (k) => { try { return localStorage.getItem("invrender." + k); } catch { return null; } },
-  set: (k, v) => { try { localStorage.setItem("invrender." + k, v); } catch { /* private window */ } } };
-
-export const captureOf = (id) => state.captures.find((c) => c.id === id);
-export function chosen() {
-  return state.profiles.find((p) => p.id === state.profile) || state.profiles[0];
-}
-export function choose(id) { state.profile = id; saved.set("profile", id); }
-
-function take_in(capture) {
-  const at = state.captures.findIndex((c) => c.id === capture.id);
-  if (at >= 0) state.captures[at] = capture;
-  else state.captures.unshift(capture);
-  state.captures.sort((a, b) => (a.id < b.id ? 1 : -1));
-}
-export { take_in as takeIn };
 
 function drawSteps() {
   const { step: now, id } = shown;
@@ -88,7 +71,7 @@ function listen() {
     document.documentElement.dataset.connected = "yes";
     if (first) route(); else if (shown.id && !captureOf(shown.id)) go("#/"); else update();
   });
-  on("capture", (capture) => { take_in(capture); update(capture.id); });
+  on("capture", (capture) => { takeIn(capture); update(capture.id); });
   on("gone", (id) => {
     state.captures = state.captures.filter((c) => c.id !== id);
     if (shown?.id === id) go("#/"); else update();
@@ -108,17 +91,6 @@ function listen() {
   };
 }
 
-state.profile = saved.get("profile");
 addEventListener("hashchange", route);
 addEventListener("error", (e) => toast(`A fault of this page: ${e.message}`));
 listen();
-
-export async function discard(capture) {
-  await api(`/api/captures/${capture.id}`, "DELETE");
-  toast(`“${capture.name}” is in the trash.`, () => api(`/api/captures/${capture.id}/restore`, "POST"), "Bring it back");
-}
-export async function example() {
-  const made = await api("/api/captures?example=1", "POST");
-  take_in(made);
-  go(`#/c/${made.id}`);
-}

@@ -1,6 +1,6 @@
 // Step 3, second half: what is found in the photo, and handles to put it right.
 import { h, svg, api, attempt, go, onChange, sentence, percent } from "./ui.js";
-import { state, captureOf, discard } from "./app.js";
+import { state, captureOf, discard } from "./state.js";
 
 const LINES = [["ball", "ball", "#7be08b"], ["horizon", "horizon in it", "#f2d75c"], ["screen", "screen in it", "#ff7a6b"], ["sample", "sample", "#62c2ff"], ["marker", "sheet's markers", "#ff7df0"]];
 const CORNERS = ["lower left", "lower right", "upper right", "upper left"];

@@ -1,6 +1,6 @@
 // The captures on this machine, or what this is about where there are none.
 import { h, drawing, attempt, onChange, percent } from "./ui.js";
-import { state, captureOf, discard, example } from "./app.js";
+import { state, captureOf, discard, example } from "./state.js";
 
 const WORDS = { new: "photo", queued: "waiting", working: "being made", done: "maps", failed: "failed" };
 

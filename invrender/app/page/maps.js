@@ -1,6 +1,6 @@
 // Step 4: the maps as they are made, then the material to look at.
 import { h, api, attempt, go, sentence, percent } from "./ui.js";
-import { captureOf, discard } from "./app.js";
+import { captureOf, discard } from "./state.js";
 
 const MAPS = [["diffuse", "Diffuse albedo"], ["specular", "Specular albedo"], ["roughness", "Roughness"], ["normal", "Normal"]];
 const STAGES = { lights: "Reading the light from the ball", preview: "A first, quick look", crop: "Cutting out the sample", read: "Loading the networks", "forward model": "Preparing the renderer", "initial maps": "The networks' first maps", refine: "Refining against the photo", render: "Rendering", write: "Writing" };

@@ -1,6 +1,6 @@
 // Step 3, first half: photos in, by drag and drop, from the disk or from the phone.
 import { h, attempt, go, sentence, toast } from "./ui.js";
-import { state, chosen, example, takeIn } from "./app.js";
+import { state, chosen, example, takeIn } from "./state.js";
 import { chooser, show } from "./tablet_step.js";
 
 const WAIT = 1000; // ms, where the server says that it is too fast

@@ -1,6 +1,6 @@
 // Step 1: the tablet, the ball and where they stand; kept as profiles.
 import { h, drawing, api, attempt, go, toast } from "./ui.js";
-import { state, chosen, choose } from "./app.js";
+import { state, chosen, choose } from "./state.js";
 
 const NUMBERS = ["side", "depth", "sample", "height", "gap", "ball", "ppi"];
 const NEEDED = ["side", "height", "gap", "ball"], OPTIONAL = ["depth", "sample", "ppi"];

@@ -1,6 +1,6 @@
 // Step 2: the pattern on the tablet, in step with this page.
 import { h, api, attempt, onChange } from "./ui.js";
-import { state, chosen } from "./app.js";
+import { state, chosen } from "./state.js";
 
 export const NAMES = { default: "The coloured pattern", turned: "The coloured pattern, turned", stripes: "Stripes", left: "Left half white", upper: "Upper half white" };
 

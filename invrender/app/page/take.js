@@ -1,6 +1,6 @@
 // Step 5: the material as other programs want it.
 import { h, api, attempt, bytes, percent, sentence } from "./ui.js";
-import { captureOf } from "./app.js";
+import { captureOf } from "./state.js";
 
 // [target, name, what it is for, file's ending, has a place for height]
 const TARGETS = [
