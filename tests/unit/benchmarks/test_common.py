@@ -11,7 +11,7 @@ from benchmarks import __main__ as command
 from benchmarks import tables as tables_command
 from benchmarks.common import tables, timing
 from benchmarks.common.plot import plot_error_over_time
-from benchmarks.common.results import bar, table, write_results
+from benchmarks.common.results import bar, cell, markdown, table, write_results
 from invrender.types import InputError
 
 NEEDED = {"probes": ["--folder", "x"]}
@@ -52,7 +52,7 @@ def test_results_are_strict_json(tmp_path):
     read = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
     assert (read["seconds"], read["n"], read["a"]) == ([1.5, None], 3, [None, True])
     assert read["bars"] == [{"name": "late", "value": None, "bar": 1, "ok": False}]
-    assert "| late |  | 1 | **no** |" in tables.markdown(tables.bars_table(read["bars"]))
+    assert "| late |  | 1 | **no** |" in markdown(tables.bars_table(read["bars"]))
 
 
 def test_table_refuses_rows_of_another_length():
@@ -65,7 +65,7 @@ def test_table_refuses_rows_of_another_length():
     (float("nan"), ""), (True, "yes"), ("0.1 → 0.2", "0.1 → 0.2"),
 ])  # fmt: skip
 def test_cells(value, text):
-    assert tables.cell(value) == text
+    assert cell(value) == text
 
 
 def test_marked_blocks_are_filled_and_stay_so(results):
