@@ -80,7 +80,9 @@ def view_around(photo: Photo, middle: Array, reach: float, shrink: float) -> Vie
     count = np.maximum((high - low) // step, 1)
     high = low + count * step
     part = photo.image[low[1] : high[1], low[0] : high[0]]
-    part = part.reshape(count[1], step, count[0], step, 3).mean((1, 3))
+    # Rows first: numpy's mean over two of five axes takes five times as long.
+    rows = part.reshape(count[1], step, -1, 3).mean(1)
+    part = rows.reshape(count[1], count[0], step, 3).mean(2)
     level = max(float(np.median(part)), BALL_VIEW.least_level * float(part.max()), TINY)
     white = min((photo.clip_level or math.inf) / level, BALL_VIEW.brightest)
     image = np.minimum(part / level, BALL_VIEW.brightest)

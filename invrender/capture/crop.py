@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from scipy import ndimage
@@ -111,11 +112,11 @@ def crop_mask(photo: Photo, rig: Rig, size: int, place: Array | None = None) -> 
     corners = rig.project(_placed(rig.sample_corners, rig, place), photo.height, photo.width)
     x0, y0 = np.maximum(np.floor(corners.min(0)).astype(int) - CROP.mask_margin, 0)
     x1, y1 = np.maximum(np.ceil(corners.max(0)).astype(int) + CROP.mask_margin, 0)
-    clipped = photo.clipped
-    if not clipped[y0:y1, x0:x1].any():
+    clipped = replace(photo, image=photo.image[y0:y1, x0:x1]).clipped
+    if not clipped.any():
         return outside
-    mask = np.zeros((*clipped.shape, 3), np.float32)
-    mask[y0:y1, x0:x1] = ndimage.maximum_filter(clipped[y0:y1, x0:x1], 3)[..., None]
+    mask = np.zeros(photo.image.shape, np.float32)
+    mask[y0:y1, x0:x1] = ndimage.maximum_filter(clipped, 3)[..., None]
     return outside | (crop_part(Photo(mask), rig, size, place)[..., 0] > CROP.touched)
 
 

@@ -35,9 +35,10 @@ def remove_glare(photo: Photo, rig: Rig, image: BallImage) -> Photo:
     use &= (at > 1).all(-1) & (at < np.array(ball.size[::-1]) - 1).all(-1)
     # The sample may shine, and so look different from the ball.
     use &= ~(np.abs(table[..., :2]) < GLARE_FIT.sample * rig.sample_size).all(-1)
-    use &= ~photo.clipped[area]
+    shown = replace(photo, image=photo.image[area])
+    use &= ~shown.clipped
     reflectance = np.asarray(rig.ball_reflectance)
-    extra = photo.image[area][use] - reflectance * sample_image(photo.image, at[use])
+    extra = shown.image[use] - reflectance * sample_image(photo.image, at[use])
     scale = float(spread(extra)) if use.any() else 0.0
     if not scale > 0:
         return photo
@@ -80,5 +81,5 @@ def remove_glare(photo: Photo, rig: Rig, image: BallImage) -> Photo:
         return photo
     result = photo.image.copy()
     clean = np.maximum(result[area] - glare(p, inside) * scale, 0)
-    result[area] = np.where(photo.clipped[area][..., None], result[area], clean)
+    result[area] = np.where(shown.clipped[..., None], result[area], clean)
     return replace(photo, image=result)

@@ -389,7 +389,8 @@ def _shows_another_pattern(screen: Screen, ball: Ball) -> bool:
 def _room_saturated(photo: Photo, rig: Rig, image: BallImage) -> float:
     """Share of the ball's pixels that show the room, above the horizon, and are saturated."""
     room = image.sky & ~image.screen(rig)
-    return float(photo.clipped[image.area][room].mean()) if room.any() else 0.0
+    clipped = replace(photo, image=photo.image[image.area]).clipped
+    return float(clipped[room].mean()) if room.any() else 0.0
 
 
 def light_warnings(lights: Lights) -> tuple[Notice, ...]:

@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from scipy import ndimage, special
 from scipy.spatial.transform import Rotation
@@ -173,9 +174,10 @@ def _blur(image: Array, sigma: float) -> Array:
     radius = int(4 * sigma) + 2
     kernel = np.diff(special.ndtr((np.arange(-radius, radius + 2) - 0.5) / sigma))
     kernel /= kernel.sum()
-    for axis in (-3, -2):
-        image = ndimage.correlate1d(image, kernel, axis=axis, mode="nearest")
-    return image
+    images = image.reshape(-1, *image.shape[-3:])
+    border = cv2.BORDER_REPLICATE
+    out = [cv2.sepFilter2D(i, -1, kernel, kernel, borderType=border) for i in images]
+    return np.asarray(out).reshape(image.shape)
 
 
 class _Fit:
@@ -361,7 +363,7 @@ class _Fit:
             parts.append(stack(curve * white * cover, 0 * cover, 0 * cover))
         out = np.zeros((len(parts), *on.shape, parts[0].shape[-1]))
         for part, image in zip(parts, out, strict=True):
-            image[on] = part.mean((1, 2))
+            image[on] = np.einsum("nijc->nc", part) / (part.shape[1] * part.shape[2])
         return self.blur(out, u, slopes)
 
     @staticmethod

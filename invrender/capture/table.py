@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -54,11 +55,9 @@ def table_blocks(photo: Photo, rig: Rig, ball: Ball) -> tuple[Array, Array, Mask
     k = max(1, photo.width // (blocks * step))
     h, w = photo.height // (k * step), photo.width // (k * step)
 
-    def cut(a: Any) -> Any:
-        a = a[step // 2 :: step, step // 2 :: step][: h * k, : w * k]
-        return a.reshape(h, k, w, k, *a.shape[2:])
-
-    mean = cut(photo.image).mean((1, 3))
+    some = photo.image[step // 2 :: step, step // 2 :: step][: h * k, : w * k]
+    mean = some.reshape(h, k, w, k, 3).mean((1, 3))
+    clipped = replace(photo, image=some).clipped.reshape(h, k, w, k).any((1, 3))
     block = k * step
     centre = np.stack(np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5), -1) * block
     points, down = points_seen(rig, centre, photo.height, photo.width)
@@ -67,7 +66,7 @@ def table_blocks(photo: Photo, rig: Rig, ball: Ball) -> tuple[Array, Array, Mask
     sample = (np.abs(points[..., :2]) < rig.sample_size / 2 + margin).all(-1)
     distance = np.linalg.norm(points - np.asarray(ball.position), axis=-1)
     use = down & ~sample & (distance > TABLE_METER.ball_margin * ball.radius_m + block)
-    use &= ~cut(photo.clipped).any((1, 3)) & (mean.min(-1) > 0)
+    use &= ~clipped & (mean.min(-1) > 0)
     return mean, points, use
 
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # which takes `invrender --help` a third of its time
@@ -18,6 +20,17 @@ if TYPE_CHECKING:  # which takes `invrender --help` a third of its time
 def cores() -> int:
     """Processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def load(*modules: str) -> None:
+    """Load modules in a thread, while this one reads a photo, for what imports them later."""
+
+    def imports() -> None:
+        with suppress(Exception):  # told where they are needed
+            for module in modules:
+                import_module(module)
+
+    threading.Thread(target=imports, daemon=True).start()
 
 
 @contextmanager

@@ -41,20 +41,20 @@ def run(args: argparse.Namespace, console: Console) -> int:
     """Run the subcommand."""
     import numpy as np
 
-    from invrender.capture.lights import find_lights
+    from invrender.cli.beside import load
     from invrender.files.capture import Capture, check_photo, holds_set, load_capture
     from invrender.files.images import read_photo
     from invrender.files.output import check_output
     from invrender.files.rig_toml import FOUND_IN_PHOTO
     from invrender.files.write import atomic_path, write_exr
     from invrender.pattern.default import default_pattern
-    from invrender.report.inspection import annotate, camera_place, summary
     from invrender.rig import Rig
 
     if args.out is not None:
         check_output(args.out, [args.capture], megabytes=PICTURE_MEGABYTES)
     if args.capture.is_dir() and holds_set(args.capture):
         return _inspect_set(args, console)
+    load("invrender.capture.lights", "invrender.report.inspection")
     if args.capture.is_dir():
         capture = load_capture(args.capture)
     else:
@@ -69,6 +69,9 @@ def run(args: argparse.Namespace, console: Console) -> int:
             warnings=photo.warnings,
             unknown=FOUND_IN_PHOTO,
         )
+    from invrender.capture.lights import find_lights
+    from invrender.report.inspection import annotate, camera_place, summary
+
     nominal = capture.rig
     found = find_lights(capture, ball=args.ball)
     capture, ball, lights = found.capture, found.ball, found.lights

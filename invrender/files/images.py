@@ -69,8 +69,12 @@ class Photo:
         """(H, W): pixels where at least one channel is saturated."""
         if self.clip_level is None:
             return np.zeros(self.image.shape[:2], bool)
-        r, g, b = (self.image[..., k] >= self.clip_level for k in range(3))
-        return np.asarray(r | g | b)
+        out = np.empty(self.image.shape[:2], bool)
+        rows = 16  # stay in the processor's caches
+        for top in range(0, self.height, rows):
+            full = self.image[top : top + rows] >= self.clip_level
+            out[top : top + rows] = full[..., 0] | full[..., 1] | full[..., 2]
+        return out
 
     def in_rec709(self) -> Photo:
         """The photo with Rec. 709 primaries; what is saturated stays so, and nothing else is."""

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, cast
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import AvifImagePlugin, Image, JpegImagePlugin, WebPImagePlugin
 from PIL.ImageFile import ImageFile
 
@@ -125,13 +126,24 @@ def _codes(path: Path, image: ImageFile, kind: str, boxes: Picture) -> tuple[Any
         im.load()
         if im.mode not in ("L", "LA", "RGB", "RGBA", "CMYK"):
             im = im.convert("RGBA" if "transparency" in im.info or "A" in im.mode else "RGB")
-        codes, white = np.asarray(im), 255
+        codes, white = _array(im), 255
     codes = codes[..., None] if codes.ndim == 2 else codes
     if im.mode == "CMYK" or codes.shape[2] in (1, 3):
         return codes, None, white
     alpha = codes[..., -1]
     opaque = alpha.min() >= white
     return codes[..., :-1], None if opaque else alpha.astype(np.float32) / white, white
+
+
+def _array(im: Image.Image) -> NDArray[np.uint8]:
+    """(H, W) or (H, W, C) codes; a few rows at once, since Pillow makes two copies."""
+    channels = len(im.getbands())
+    codes = np.empty((im.height, im.width, channels)[: 3 if channels > 1 else 2], np.uint8)
+    rows = 256
+    for top in range(0, im.height, rows):
+        part = codes[top : top + rows]
+        part[:] = np.asarray(im.crop((0, top, im.width, top + len(part))))
+    return codes
 
 
 def _encoding(path: Path, raster: Raster, profile: bytes | None, boxes: Picture) -> Encoding:

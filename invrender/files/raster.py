@@ -252,6 +252,10 @@ def _to_light(
         if table.ndim == 2:
             for k in range(3):
                 out[..., k] = table[values[..., min(k, values.shape[2] - 1)], k]
+        elif values.shape[2] == 3 and values.dtype == np.uint8:
+            import cv2  # a seventh of numpy's time; it takes 0.1 s to import
+
+            cv2.LUT(values, table, out)
         elif values.shape[2] == 3:
             np.take(table, values, out=out, mode="clip")  # the mode saves a copy
         else:

@@ -85,7 +85,8 @@ def _exposure(found: FoundLights) -> Said:
     at = corners(photo, rig)
     low, high = np.floor(np.clip([at.min(0), at.max(0)], 0, None)).astype(int)
     seen = photo.image[low[1] : high[1] + 1, low[0] : high[0] + 1]
-    level = float(np.quantile(seen.max(-1), 0.9)) / photo.clip_level if seen.size else 1.0
+    brightest = np.maximum(np.maximum(seen[..., 0], seen[..., 1]), seen[..., 2])
+    level = float(np.quantile(brightest, 0.9)) / photo.clip_level if seen.size else 1.0
     dark = level < WANTED.sample_level
     if dark:
         times = WANTED.sample_aim / max(level, WANTED.sample_aim / WANTED.most_longer)

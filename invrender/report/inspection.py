@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -139,6 +140,7 @@ def annotate(found: FoundLights) -> Image.Image:
     photo, rig, ball, sheet = found.capture.photo, found.lights.rig, found.ball, found.sheet
     step = max(1, math.ceil(max(photo.width, photo.height) / SHOWN))
     white = max(float(np.percentile(photo.image[::step, ::step], 99)), 1e-9)
+    saturated = photo.clip_level is not None and photo.image.max() >= photo.clip_level
     lines = outlines(rig, ball, photo.height, photo.width)
     if sheet is not None:
         lines |= {f"marker {i}": quad for i, quad in zip(sheet.ids, sheet.corners, strict=True)}
@@ -146,8 +148,9 @@ def annotate(found: FoundLights) -> Image.Image:
     def part(x0: int, y0: int, x1: int, y1: int, scale: float) -> Image.Image:
         """A rectangle of the photo with its lines; a pixel is ``scale`` pixels wide."""
         every = max(1, round(1 / scale))
-        tone = linear_to_srgb(photo.image[y0:y1:every, x0:x1:every] / white) * 255 + 0.5
-        tone[photo.clipped[y0:y1:every, x0:x1:every]] = ImageColor.getrgb(COLOURS["saturated"])
+        some = replace(photo, image=photo.image[y0:y1:every, x0:x1:every])
+        tone = linear_to_srgb(some.image / white) * 255 + 0.5
+        tone[some.clipped] = ImageColor.getrgb(COLOURS["saturated"])
         picture = Image.fromarray(tone.astype(np.uint8))
         if scale > 1:
             size = round((x1 - x0) * scale), round((y1 - y0) * scale)
@@ -176,7 +179,7 @@ def annotate(found: FoundLights) -> Image.Image:
         "ball": f"ball ({rig.ball_shape})", "horizon": "horizon in it",
         "screen": "screen in it, with its corners" if rig.has_screen else "", "sample": "sample",
         "marker": f"{len(sheet.ids)} markers of the capture sheet" if sheet else "",
-        "saturated": "saturated" if photo.clipped.any() else "",
+        "saturated": "saturated" if saturated else "",
     })  # fmt: skip
     return picture
 
