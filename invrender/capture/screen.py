@@ -135,17 +135,29 @@ _APART = np.eye(3) - 1 / 3  # of what channels differ from their mean
 _PAIRS = [(i, j) for i in range(3) for j in range(3) if i != j]  # of channels: `_MIXING`
 
 
-def _cover(s: Array) -> tuple[Array, Array]:
-    """Share of each sub-pixel (h, w, n, n) whose coordinate lies in [0, 1]; its derivative."""
-    across = np.abs(s[:, :, :, -1:] - s[:, :, :, :1]) + np.abs(s[:, :, -1:] - s[:, :, :1])
-    width = np.maximum(across / (s.shape[3] - 1), SCREEN_FIT.least_width)
+def _times(lines: Array, forms: Array) -> Array:
+    """Lines (..., 6) times forms (6, m), by one product of matrices: (m, ...)."""
+    return np.asarray(forms.T @ lines.reshape(-1, 6).T).reshape(-1, *lines.shape[:-1])
+
+
+def _rows(image: Array, matrix: Array) -> Array:
+    """Images (..., 3) times a matrix (3, m), by one product: (..., m)."""
+    return np.asarray((image.reshape(-1, 3) @ matrix).reshape(*image.shape[:-1], -1))
+
+
+def _cover(s: Array, slopes: bool) -> list[Array]:
+    """Share of each sub-pixel (n, n, h, w) whose coordinate lies in [0, 1]; its derivative."""
+    across = np.abs(s[:, -1:] - s[:, :1]) + np.abs(s[-1:] - s[:1])
+    width = np.maximum(across / (len(s) - 1), SCREEN_FIT.least_width)
     cover = 0.5 + (0.5 - abs(s - 0.5)) / width
-    slope = np.where((cover > 0) & (cover < 1), -np.sign(s - 0.5) / width, 0)
-    return np.clip(cover, 0, 1), slope
+    out: list[Array] = [np.clip(cover, 0, 1)]
+    if slopes:
+        out.append(np.where((cover > 0) & (cover < 1), -np.sign(s - 0.5) / width, 0))
+    return out
 
 
 def _look_up(image: Array, s: Array, t: Array, slopes: bool) -> list[Array]:
-    """Bilinear look-ups (..., 3) in (n, n, 3), row 0 at t = 1; their derivatives by s and t.
+    """Bilinear look-ups (3, ...) in (n, n, 3), row 0 at t = 1; their derivatives by s and t.
 
     Written by hand for the derivatives, which `scipy.ndimage` does not give.
     """
@@ -153,14 +165,14 @@ def _look_up(image: Array, s: Array, t: Array, slopes: bool) -> list[Array]:
     last = n - SCREEN_FIT.last_cell
     x, y = (np.clip(q * n - 0.5, 0, last) for q in (s, 1 - t))
     i, j = y.astype(int), x.astype(int)
-    fy, fx = (y - i)[..., None], (x - j)[..., None]
-    flat, k = image.reshape(n * n, 3), i * n + j
-    corners = [flat[k + d] for d in (0, 1, n, n + 1)]
+    fy, fx = y - i, x - j
+    planes, k = np.moveaxis(image, -1, 0).reshape(3, n * n), i * n + j
+    corners = [planes[:, k + d] for d in (0, 1, n, n + 1)]
     top, bottom = (a + fx * (b - a) for a, b in (corners[:2], corners[2:]))
     out = [top + fy * (bottom - top)]
     if slopes:
         right = [b - a for a, b in (corners[:2], corners[2:])]
-        inside = [((q > 0) & (q < last))[..., None] * n for q in (x, y)]
+        inside = [((q > 0) & (q < last)) * n for q in (x, y)]
         out += [(right[0] + fy * (right[1] - right[0])) * inside[0], (top - bottom) * inside[1]]
     return out
 
@@ -212,11 +224,11 @@ class _Fit:
             luma = (encoded @ np.array(JPEG_LUMA))[..., None]
             colours = _blur(encoded - luma, SCREEN_FIT.colour_pooling)
             self.observed = np.maximum(luma + colours, 0) ** JPEG_GAMMA
-        # Mirrored rays of the sub-pixels (h, w, n, n) as lines in space, moment and direction
+        # Mirrored rays of the sub-pixels (n, n, h, w) as lines in space, moment and direction
         # (Plücker): where one meets a plane is a fraction of linear forms in it.
         at = (np.arange(n) + 0.5) * step / n
-        y = rows.start + step * np.arange(h)[:, None, None, None] + at[:, None]
-        x = columns.start + step * np.arange(w)[:, None, None] + at
+        y = rows.start + step * np.arange(h)[:, None] + at[:, None, None, None]
+        x = columns.start + step * np.arange(w) + at[:, None, None]
         point, mirrored, seen = trace_ball(rig, ball, np.stack(np.broadcast_arrays(x, y), -1))
         self.lines = np.concatenate([np.cross(point, mirrored), mirrored], -1)
         self.seen = seen & (mirrored[..., 2] > SCREEN_FIT.upward[0])
@@ -316,16 +328,18 @@ class _Fit:
         free, by falloff where that is, by log gamma, each channel's by its own, and by blur.
         """
         forms = self.forms(u)
-        a, b, c = np.moveaxis(self.lines @ forms, -1, 0)
+        a, b, c = _times(self.lines, forms)
         front = self.seen & (c > 0)
         c = np.where(front, c, 1)
         s, t = a / c, b / c
-        cover_s, edge_s = _cover(s)
-        cover_t, edge_t = _cover(t)
+        cover_s, *edge_s = _cover(s, slopes)
+        cover_t, *edge_t = _cover(t, slopes)
         cover_s *= front
-        on = (cover_s * cover_t > 0).any((2, 3))
-        s, t, c, cover_s, cover_t = (q[on] for q in (s, t, c, cover_s, cover_t))
-        cover = (cover_s * cover_t)[..., None]
+        on = (cover_s * cover_t > 0).any((0, 1))
+        # Pixels last: numpy is slow along short axes.
+        s, t, c, cover_s, cover_t = (q[:, :, on] for q in (s, t, c, cover_s, cover_t))
+        lines = self.lines[:, :, on]
+        cover = cover_s * cover_t
         gamma = np.exp(u[_GAMMA])
         shown = self.pattern**gamma
         light, *by_place = _look_up(shown, s, t, slopes)
@@ -334,17 +348,17 @@ class _Fit:
         if dims:
             e_x, e_y, _ = self.screen(u)
             up = np.cross(e_x, e_y)
-            cosine = self.lines[on][..., 3:] @ (up / np.linalg.norm(up))
-            log_cosine = np.log(np.maximum(cosine, SCREEN_FIT.upward[0]))[..., None]
+            cosine = lines[..., 3:] @ (up / np.linalg.norm(up))
+            log_cosine = np.log(np.maximum(cosine, SCREEN_FIT.upward[0]))
             white = np.exp(u[_FALLOFF] * log_cosine)
             light, by_place = light * white, [d * white for d in by_place]
 
         def stack(light: Array, white: Array, share: Array) -> Array:
-            return np.concatenate([light, white, share] if dims else [light, share], -1)
+            return np.stack([*light, white, share] if dims else [*light, share])
 
         parts = [stack(light * cover, white * cover, cover)]
         if slopes:
-            edges = (e[..., None] for e in (edge_s[on] * cover_t, edge_t[on] * cover_s))
+            edges = (edge_s[0][:, :, on] * cover_t, edge_t[0][:, :, on] * cover_s)
             by_s, by_t = (
                 stack(d * cover + light * e, white * e, e)
                 for d, e in zip(by_place, edges, strict=True)
@@ -352,18 +366,17 @@ class _Fit:
             if self.free[0]:
                 step = SCREEN_FIT.difference
                 change = (self.forms(u + step * np.eye(6, _COUNT)) - forms) / step
-                moved = self.lines[on] @ np.concatenate(list(change), -1)
-                for da, db, dc in np.moveaxis(moved, -1, 0).reshape(6, 3, *s.shape):
-                    ds, dt = (((d - q * dc) / c)[..., None] for d, q in ((da, s), (db, t)))
-                    parts.append(by_s * ds + by_t * dt)
+                moved = _times(lines, np.concatenate(list(change), -1))
+                for da, db, dc in moved.reshape(6, 3, *s.shape):
+                    parts.append(by_s * ((da - s * dc) / c) + by_t * ((db - t * dc) / c))
             if self.free[_FALLOFF]:
                 by_falloff = log_cosine * cover
                 parts.append(stack(light * by_falloff, white * by_falloff, 0 * cover))
             (curve,) = _look_up(shown * np.log(self.pattern) * gamma, s, t, False)
             parts.append(stack(curve * white * cover, 0 * cover, 0 * cover))
-        out = np.zeros((len(parts), *on.shape, parts[0].shape[-1]))
+        out = np.zeros((len(parts), *on.shape, len(parts[0])))
         for part, image in zip(parts, out, strict=True):
-            image[on] = np.einsum("nijc->nc", part) / (part.shape[1] * part.shape[2])
+            image[on] = part.mean((1, 2)).T
         return self.blur(out, u, slopes)
 
     @staticmethod
@@ -492,7 +505,7 @@ class _Fit:
 
     def expected(self, u: Array, seen: Array) -> Array:
         """Radiance (..., H, W, 3) of the pixels; or its derivative by what changes ``seen``."""
-        light = self.raw(u, seen) @ self.mixing(u).T * np.exp(u[_GAIN])
+        light = _rows(self.raw(u, seen), self.mixing(u).T * np.exp(u[_GAIN]))
         room = (1 - seen[..., -1:]) if seen.ndim == 3 else -seen[..., -1:]
         return np.asarray(light + room * self.room)
 
@@ -528,7 +541,7 @@ class _Fit:
     @staticmethod
     def blur_colours(u: Array, image: Array) -> Array:
         """Encoded images (..., H, W, 3) with their colours blurred as ``u`` says."""
-        luma = (image @ np.array(JPEG_LUMA))[..., None]
+        luma = _rows(image, np.array(JPEG_LUMA)[:, None])
         sigma = math.hypot(math.exp(u[_COLOUR]), SCREEN_FIT.colour_pooling)
         return np.asarray(luma + _blur(image - luma, sigma))
 

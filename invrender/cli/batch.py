@@ -18,6 +18,10 @@ from invrender.types import InputError
 if TYPE_CHECKING:
     from invrender.cli.beside import Submit
 
+# Captures whose lights are found while another is solved. Of a large photo they take as long as
+# the rest, on one processor of two, of which the rest leaves a half.
+AHEAD = 2
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -63,9 +67,9 @@ def refine_captures(
             yield Outcome(name, "skipped", report)
         else:
             jobs.append((folder, out / name, options))
-    # One process solves a capture while another finds the lights of the next.
+    # One process solves a capture while others find the lights of the next.
     alone = len(jobs) < 2 or scheduler or workers > 1 or cores() == 1
-    with nullcontext() if alone else beside() as submit:
+    with nullcontext() if alone else beside(AHEAD) as submit:
         yield from _outcomes(jobs, _ahead(jobs, submit) if submit else jobs, scheduler, workers)
 
 
@@ -73,7 +77,7 @@ Job = tuple[Path, Path, dict[str, Any]]
 
 
 def _ahead(jobs: Sequence[Job], submit: Submit) -> Iterator[Job]:
-    """The jobs, each with what is prepared for it, which for the next begins with it."""
+    """The jobs, each with what is prepared for it, which for the next `AHEAD` begins with it."""
     from invrender.pipeline import prepare
 
     def begin(job: Job) -> Any:
@@ -82,10 +86,10 @@ def _ahead(jobs: Sequence[Job], submit: Submit) -> Iterator[Job]:
         with suppress(BrokenProcessPool):
             return submit(prepare, [job[0]], known, options.get("size", 256))
 
-    following = begin(jobs[0])
+    begun = [begin(job) for job in jobs[:AHEAD]]
     for i, (folder, out, options) in enumerate(jobs):
-        prepared, following = following, begin(jobs[i + 1]) if i + 1 < len(jobs) else None
-        yield folder, out, {**options, "prepared": prepared}
+        begun += [begin(job) for job in jobs[i + AHEAD : i + AHEAD + 1]]
+        yield folder, out, {**options, "prepared": begun.pop(0)}
 
 
 def _outcomes(

@@ -34,9 +34,9 @@ def load(*modules: str) -> None:
 
 
 @contextmanager
-def beside() -> Iterator[Submit]:
-    """A process of its own; what is yielded submits a call to it, which must be importable, and
-    returns the call's future. The process ends with the block, at once where an error ends it."""
+def beside(processes: int = 1) -> Iterator[Submit]:
+    """Processes of their own; what is yielded submits a call to one, which must be importable, and
+    returns the call's future. They end with the block, at once where an error ends it."""
     import multiprocessing
     from concurrent.futures import ProcessPoolExecutor
 
@@ -44,7 +44,7 @@ def beside() -> Iterator[Submit]:
     # A copy of this process has what is loaded; with threads of Dr.Jit or torch it might hang.
     copied = sys.platform == "linux" and not {"drjit", "torch"} & sys.modules.keys()
     context = multiprocessing.get_context("fork" if copied else "spawn")
-    pool = ProcessPoolExecutor(1, context, _leave_ctrl_c)
+    pool = ProcessPoolExecutor(processes, context, _leave_ctrl_c)
     try:
         yield pool.submit
     except BaseException:
