@@ -6,13 +6,15 @@ with the lights that the ball shows and registered by the photos ("found"), with
 true places ("true places"), and with the true lights at the true places ("true lights"). Then the
 same sample without a tablet: six photos, each under its own lamp, near and moved about.
 
-Photographs are kept in DIR/captures. Without folders, and with --quick, materials and rooms are
-procedural.
+Photographs are kept in DIR/captures and rows in DIR/results.json, so that a run that was stopped
+goes on, and another of more samples or photos adds to it. Without folders, and with --quick,
+materials and rooms are procedural.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import tempfile
 import time
@@ -69,6 +71,7 @@ OF_A_SET = 5  # photos, whose errors the bars are for
 WITHOUT = 1.0  # average error without a tablet over one photo's with one
 
 Row = dict[str, Any]
+Results = dict[str, dict[int, list[Row]]]  # by stage and number of photos
 
 
 def hand_held(rng: np.random.Generator) -> Rig:
@@ -125,48 +128,42 @@ def photograph_set(
     return np.maximum(photo + sigma * rng.standard_normal(photo.shape), 0)
 
 
-def make_sets(
-    out: Path, chosen: Sequence[int], photos: int, lamps: int, size: int, width: int, spp: int,
+def make_set(
+    out: Path, k: int, photos: int, lamps: int, size: int, width: int, spp: int,
     materials: Path | None, rooms: Path | None,
-) -> list[tuple[list[Path], list[Path]]]:  # fmt: skip
-    """Captures ``out``/000/1 and so on under the patterns, and ``out``/000/lamp_1 and so on without
-    a tablet, a photo each; simulates those that are not there yet."""
+) -> tuple[list[Path], list[Path]]:  # fmt: skip
+    """Captures ``out``/000/1 and so on of sample k under the patterns, and ``out``/000/lamp_1 and
+    so on without a tablet, a photo each; simulates those that are not there yet."""
+    shown = [out / f"{k:03d}" / str(i + 1) for i in range(photos)]
+    lit = [out / f"{k:03d}" / f"lamp_{i + 1}" for i in range(lamps)]
+    maps, room, _ = sample_and_room(k, SEVERAL, size, materials, rooms)
+    moved = draw_lamps(SEVERAL.first_seed + k, lamps)
     patterns = pattern_set(max(COUNTS))
-    sets = [
-        (
-            [out / f"{k:03d}" / str(i + 1) for i in range(photos)],
-            [out / f"{k:03d}" / f"lamp_{i + 1}" for i in range(lamps)],
-        )
-        for k in chosen
+    pictures: list[tuple[int, Path, Array, Lamp | None]] = [
+        *((i, folder, patterns[i], None) for i, folder in enumerate(shown)),
+        *((len(patterns) + i, folder, NO_PATTERN, moved[i]) for i, folder in enumerate(lit)),
     ]
-    for k, (shown, lit) in zip(chosen, sets, strict=True):
-        maps, room, _ = sample_and_room(k, SEVERAL, size, materials, rooms)
-        moved = draw_lamps(SEVERAL.first_seed + k, lamps)
-        pictures: list[tuple[Path, Array, Lamp | None]] = [
-            *((folder, pattern, None) for folder, pattern in zip(shown, patterns, strict=False)),
-            *((folder, NO_PATTERN, lamp) for folder, lamp in zip(lit, moved, strict=True)),
-        ]
-        for i, (folder, pattern, lamp) in enumerate(pictures):
-            if folder.exists():
-                continue
-            rig, nominal = hand_held(np.random.default_rng((SEVERAL.first_seed, k, i))), Rig()
-            if lamp is not None:
-                rig, nominal = without_screen(rig), without_screen(nominal)
-            lights = Lights(rig, pattern, room, GAIN)
-            folder.parent.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".") as name:
-                new = Path(name) / "capture"
-                (new / "truth").mkdir(parents=True)
-                photo = photograph_set(rig, maps, lights, width, spp, 16 * k + i, lamp)
-                write_exr(new / "photo.exr", photo, half=True)
-                if lamp is None:
-                    write_exr(new / "pattern.exr", pattern, half=True)
-                write_rig(new / "rig.toml", nominal, "pattern.exr", "truth/")
-                write_rig(new / "truth" / "rig.toml", rig)
-                write_maps(new / "truth", maps, half=True, width=rig.sample_size)
-                write_exr(new / "truth" / "environment.exr", room, half=True)
-                os.replace(new, folder)
-    return sets
+    for i, folder, pattern, lamp in pictures:
+        if folder.exists():
+            continue
+        rig, nominal = hand_held(np.random.default_rng((SEVERAL.first_seed, k, i))), Rig()
+        if lamp is not None:
+            rig, nominal = without_screen(rig), without_screen(nominal)
+        lights = Lights(rig, pattern, room, GAIN)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".") as name:
+            new = Path(name) / "capture"
+            (new / "truth").mkdir(parents=True)
+            photo = photograph_set(rig, maps, lights, width, spp, 16 * k + i, lamp)
+            write_exr(new / "photo.exr", photo, half=True)
+            if lamp is None:
+                write_exr(new / "pattern.exr", pattern, half=True)
+            write_rig(new / "rig.toml", nominal, "pattern.exr", "truth/")
+            write_rig(new / "truth" / "rig.toml", rig)
+            write_maps(new / "truth", maps, half=True, width=rig.sample_size)
+            write_exr(new / "truth" / "environment.exr", room, half=True)
+            os.replace(new, folder)
+    return shown, lit
 
 
 def find(folder: Path, patterns: Sequence[Array], which: int) -> tuple[FoundLights | None, bool]:
@@ -261,42 +258,62 @@ def pooled(rows: Sequence[Row], kind: str) -> float:
     return float(np.sqrt(np.mean([r[kind] ** 2 for r in rows])))
 
 
-def error_table(results: dict[str, dict[int, list[Row]]]) -> Table:
+def over_one(results: Results, rows: Sequence[Row], kind: str) -> float:
+    """Pooled error of rows over that of one photo, as it is found, of the same samples."""
+    samples = {r["sample"] for r in rows}
+    return pooled(rows, kind) / pooled(
+        [r for r in results[FOUND][1] if r["sample"] in samples], kind
+    )
+
+
+def error_table(results: Results) -> Table:
     """Errors by stage and number of photos, each over that of one photo as it is found."""
-    one = {kind: pooled(results[FOUND][1], kind) for kind in KINDS}
     lines = [
-        [stage, number, *(pooled(rows, kind) / one[kind] for kind in KINDS)]
+        [stage, number, len(rows), *(over_one(results, rows, kind) for kind in KINDS)]
         for stage, by_number in results.items()
         for number, rows in by_number.items()
+        if rows
     ]
-    return table(["lights", "photos", *KINDS], lines)
+    return table(["lights", "photos", "samples", *KINDS], lines)
 
 
-def bars(results: dict[str, dict[int, list[Row]]], recognised: float) -> list[Bar]:
+def sample_table(results: Results) -> Table:
+    """Errors of a set's photos and of those without a tablet, over one photo's, by sample."""
+    lines = [
+        [row["sample"], stage, number, *(over_one(results, [row], kind) for kind in KINDS)]
+        for stage, number in ((FOUND, OF_A_SET), (NO_TABLET, LAMP_PHOTOS))
+        for row in results.get(stage, {}).get(number, [])
+    ]
+    return table(["sample", "lights", "photos", *KINDS], lines)
+
+
+def bars(results: Results, recognised: float) -> list[Bar]:
     several = results[FOUND].get(OF_A_SET) or results[FOUND][max(results[FOUND])]
     lines = [
-        bar(f"{kind}, set over one photo", pooled(several, kind) / pooled(results[FOUND][1], kind),
-            most, False)
+        bar(f"{kind}, set over one photo", over_one(results, several, kind), most, False)
         for kind, most in RATIOS.items()
-    ]  # fmt: skip
+        if several
+    ]
     for number, rows in results.get(NO_TABLET, {}).items():
-        ratio = pooled(rows, "average") / pooled(results[FOUND][1], "average")
-        lines.append(bar(f"average, {number} photos without a tablet", ratio, WITHOUT, False))
+        if rows:
+            ratio = over_one(results, rows, "average")
+            lines.append(bar(f"average, {number} photos without a tablet", ratio, WITHOUT, False))
     return [*lines, bar("patterns recognised", recognised, 1.0, True)]
 
 
-def plot(results: dict[str, dict[int, list[Row]]], file: Path) -> None:
+def plot(results: Results, file: Path) -> None:
     """Errors over one photo's against the number of photos, and against processor time."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.6), sharey=True)
-    one = {kind: pooled(results[FOUND][1], kind) for kind in KINDS}
     for stage, by_number in results.items():
-        errors = [pooled(rows, "average") / one["average"] for rows in by_number.values()]
-        left.plot(list(by_number), errors, "o-", label=f"average, {stage}")
-        seconds = [np.mean([r["processor_seconds"] for r in rows]) for rows in by_number.values()]
+        known = {n: rows for n, rows in by_number.items() if rows}
+        errors = [over_one(results, rows, "average") for rows in known.values()]
+        left.plot(list(known), errors, "o-", label=f"average, {stage}")
+        seconds = [np.mean([r["processor_seconds"] for r in rows]) for rows in known.values()]
         right.plot(seconds, errors, "o-")
+    known = {n: rows for n, rows in results[FOUND].items() if rows}
     for kind in NAMES:
-        errors = [pooled(rows, kind) / one[kind] for rows in results[FOUND].values()]
-        left.plot(list(results[FOUND]), errors, ":", label=f"{kind}, {FOUND}")
+        errors = [over_one(results, rows, kind) for rows in known.values()]
+        left.plot(list(known), errors, ":", label=f"{kind}, {FOUND}")
     left.set(xlabel="photos", ylabel="RMSE over one photo's")
     right.set(xlabel="processor seconds, lights included", xscale="log", yscale="log")
     left.legend(fontsize=7)
@@ -305,6 +322,19 @@ def plot(results: dict[str, dict[int, list[Row]]], file: Path) -> None:
     figure.tight_layout()
     figure.savefig(file, dpi=120)
     plt.close(figure)
+
+
+def kept(out: Path) -> tuple[Results, dict[str, list[bool]]]:
+    """The rows that a run before has left, and for each sample which patterns it recognised."""
+    file = out / "results.json"
+    if not file.exists():
+        return {}, {}
+    content = json.loads(file.read_text())
+    rows = {
+        stage: {int(n): of_n for n, of_n in sorted(by.items(), key=lambda x: int(x[0]))}
+        for stage, by in content["rows"].items()
+    }
+    return rows, content["recognised"]
 
 
 def parser() -> argparse.ArgumentParser:
@@ -327,11 +357,28 @@ def main(args: argparse.Namespace) -> None:
         real, lamps, stages = (args.materials, args.envs), LAMP_PHOTOS, args.stages
     chosen = range(args.first, args.first + count)
     patterns = pattern_set(max(COUNTS))
-    sets = make_sets(args.out / "captures", chosen, max(numbers), lamps, size, width, spp, *real)
-    results: dict[str, dict[int, list[Row]]] = {stage: {n: [] for n in numbers} for stage in stages}
-    results[NO_TABLET] = {lamps: []}
-    recognised = []
+    results, seen = kept(args.out)
+    for stage in (*stages, NO_TABLET):
+        for n in [lamps] if stage == NO_TABLET else numbers:
+            results.setdefault(stage, {}).setdefault(n, [])
     networks = load_networks()
+
+    def missing(sample: str, stage: str, number: int) -> bool:
+        return all(row["sample"] != sample for row in results[stage][number])
+
+    def keep() -> None:
+        """What there is so far, which a run that is stopped leaves."""
+        for by_number in results.values():
+            for rows in by_number.values():
+                rows.sort(key=lambda row: str(row["sample"]))
+        share = float(np.mean([right for of_one in seen.values() for right in of_one]))
+        content = {"rows": results, "recognised": seen, "bars": bars(results, share)}
+        plot(results, args.out / "several.png")
+        tables = {
+            "errors over those of one photo": error_table(results),
+            "errors over those of one photo, by sample": sample_table(results),
+        }
+        write_results(args.out, content, tables)
 
     def judge(
         found: Sequence[FoundLights | None], seconds: float, folders: Sequence[Path], stage: str
@@ -339,9 +386,13 @@ def main(args: argparse.Namespace) -> None:
         """A row for the photos, whose lights took so long each; those without a ball are left out,
         as `invrender refine` does."""
         used = [(f, p) for f, p in zip(found, folders, strict=True) if f is not None]
-        row = measure([f for f, _ in used], [p for _, p in used], size, stage, networks)
-        row["processor_seconds"] += seconds * len(found)
         name = folders[0].parent.name
+        try:
+            row = measure([f for f, _ in used], [p for _, p in used], size, stage, networks)
+        except InputError as error:
+            print(f"{name}, {stage}, {len(found)}: {error}", flush=True)
+            return
+        row["processor_seconds"] += seconds * len(found)
         results[stage][len(found)].append({"sample": name, "used": len(used), **row})
         print(
             f"{name}, {stage}, {len(found)}: "
@@ -350,23 +401,25 @@ def main(args: argparse.Namespace) -> None:
             + f"; {row['processor_seconds']:.1f} processor s",
             flush=True,
         )
+        keep()
 
-    for folders, lit in sets:
-        cpu = time.process_time()
-        told = [find(folder, patterns[: max(numbers)], i) for i, folder in enumerate(folders)]
-        found = [lights for lights, _ in told]
-        recognised += [right for _, right in told]
-        cpu = (time.process_time() - cpu) / len(folders)
-        if found[0] is None:  # there is no photo to compare with
-            continue
-        for stage in stages:
-            for n in numbers:
+    for k in chosen:
+        folders, lit = make_set(
+            args.out / "captures", k, max(numbers), lamps, size, width, spp, *real
+        )
+        sample = folders[0].parent.name
+        wanted = [(stage, n) for stage in stages for n in numbers if missing(sample, stage, n)]
+        if wanted:
+            cpu = time.process_time()
+            told = [find(folder, patterns[: max(numbers)], i) for i, folder in enumerate(folders)]
+            found = [lights for lights, _ in told]
+            seen[sample] = [right for _, right in told]
+            cpu = (time.process_time() - cpu) / len(folders)
+            if found[0] is None:  # there is no photo to compare with
+                continue
+            for stage, n in wanted:
                 judge(found[:n], cpu, folders[:n], stage)
-        cpu = time.process_time()
-        found = [find(folder, [], -1)[0] for folder in lit]
-        judge(found, (time.process_time() - cpu) / len(lit), lit, NO_TABLET)
-        # A run that is stopped leaves what it has.
-        share = float(np.mean(recognised))
-        content = {"rows": results, "recognised": share, "bars": bars(results, share)}
-        plot(results, args.out / "several.png")
-        write_results(args.out, content, {"errors over those of one photo": error_table(results)})
+        if missing(sample, NO_TABLET, lamps):
+            cpu = time.process_time()
+            found = [find(folder, [], -1)[0] for folder in lit]
+            judge(found, (time.process_time() - cpu) / len(lit), lit, NO_TABLET)

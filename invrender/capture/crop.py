@@ -27,12 +27,14 @@ def crop_sample(photo: Photo, rig: Rig, size: int = 256) -> Array:
 
 
 def crop_part(
-    photo: Photo, rig: Rig, size: int, place: Array | None = None, sharp: bool = False
-) -> Array:
+    photo: Photo, rig: Rig, size: int, place: Array | None = None, sharp: bool = False,
+    around: bool = False,
+) -> Array:  # fmt: skip
     """As `crop_sample`, of another part of the table: where the homography ``place`` (3, 3) takes
     the sample's square, [-1, 1]², x right and y up. What is beyond the photo is its border.
 
-    sharp: the photo is the spline whose means over its pixels are the photo's values, so that
+    around: what lies around the photo's own square too, not the nearest of the square. sharp: the
+    photo is the spline whose means over its pixels are the photo's values, so that
     neither the size of these nor interpolation blurs.
     """
     if size < 1:
@@ -50,12 +52,12 @@ def crop_part(
     planes = [np.asarray(crop[..., c], np.float32) for c in range(3)]
     if wide > 1:
         planes = [ndimage.uniform_filter(plane, wide, mode="nearest") for plane in planes]
-    around = 0
+    margin = 0
     spline = order + sharp  # a spline's means over pixels are values of the one of the next order
     if spline > 1:  # as `map_coordinates` does it, but once for all bands
-        around = CROP.spline_margin
+        margin = CROP.spline_margin
         planes = [
-            ndimage.spline_filter(np.pad(p, around, mode="edge"), spline, mode="nearest")
+            ndimage.spline_filter(np.pad(p, margin, mode="edge"), spline, mode="nearest")
             for p in planes
         ]
     # Next to the border the lens mixes in what lies around the sample, often white paper.
@@ -66,9 +68,10 @@ def crop_part(
     for top in range(0, size, rows):
         band = slice(top, min(top + rows, size))
         points = _placed(_sample_rows(rig, size * samples, band, samples), rig, place)
-        points[..., :2] = np.clip(points[..., :2], -inner, inner)
+        if not around:
+            points[..., :2] = np.clip(points[..., :2], -inner, inner)
         pixels = rig.project(points, h, w)
-        at = np.stack([pixels[..., 1] - y0 - 0.5, pixels[..., 0] - x0 - 0.5]) + around
+        at = np.stack([pixels[..., 1] - y0 - 0.5, pixels[..., 0] - x0 - 0.5]) + margin
         for c, plane in enumerate(planes):
             fine = ndimage.map_coordinates(plane, at, order=order, mode="nearest", prefilter=False)
             mean = fine.reshape(-1, samples, size, samples).mean((1, 3))

@@ -42,6 +42,11 @@ class PlacementSettings:
     doubt: float = 0.05
     least: float = 0.15  # correlation of what belongs together
     clearly: float = 0.08  # by how much a turned sample must be more alike
+    blurs: tuple[float, ...] = (5.0, 2.5, 1.0)  # pixels, one alignment after another
+    steps: int = 60  # of each, at most
+    settled: float = 1e-5  # gain of the correlation below which they end
+    dark: float = 0.01  # of the mean radiance, below which nothing counts
+    askew: float = 0.2  # most that it moves a corner
 
 
 PLACEMENT = PlacementSettings()
@@ -63,12 +68,51 @@ def find_place(photos: tuple[Photo, Photo], rigs: tuple[Rig, Rig]) -> tuple[Arra
     if turn:  # the table has not turned with it
         wide = np.eye(3)
     parts = place @ wide, wide
-    crops = [crop_part(p, r, s.shift_side, h) for p, r, h in zip(photos, rigs, parts, strict=True)]
+    crops = [
+        crop_part(p, r, s.shift_side, h, around=True)
+        for p, r, h in zip(photos, rigs, parts, strict=True)
+    ]
     seen = [in_photo(p, r, s.shift_side, h) for p, r, h in zip(photos, rigs, parts, strict=True)]
     shift, alike = find_shift(crops[0], crops[1], (seen[0], seen[1]))
     if np.hypot(*shift) > s.least_shift:
         place[:2, 2] = place[:2, :2] @ shift * wide[0, 0]
+    # Where the square was missed, the camera is a degree or two off, which fine texture hides.
+    crops[0] = crop_part(photos[0], rigs[0], s.shift_side, place @ wide, around=True)
+    askew = find_askew(crops[0], crops[1])
+    if askew is not None:
+        straight = place @ wide @ askew @ np.linalg.inv(wide)
+        again = crop_part(photos[0], rigs[0], s.shift_side, straight @ wide, around=True)
+        windows = (seen[1].astype(np.float32),) * 2
+        better = best_shift(features(again, s), features(crops[1], s), windows, s)[0]
+        if better > alike + s.clearly:
+            return straight / straight[2, 2], better
     return place, alike
+
+
+def find_askew(image: Array, first: Array, s: PlacementSettings = PLACEMENT) -> Array | None:
+    """The homography (3, 3) from the square, [-1, 1]², of ``first`` to that of ``image`` by which
+    they correlate most (ECC, Evangelidis and Psarakis 2008); None where they have little in common
+    or it is far off. A sample's border is what it finds where the texture is fine."""
+    import cv2
+
+    n = len(first)
+    pixels = np.array([[n / 2, 0, n / 2 - 0.5], [0, -n / 2, n / 2 - 0.5], [0, 0, 1]])
+    warp = np.eye(3, dtype=np.float32)
+    logs = [np.log(x.mean(-1) + s.dark * float(x.mean()) + TINY) for x in (first, image)]
+    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, s.steps, s.settled)
+    for blur in s.blurs:
+        there, here = (
+            ndimage.gaussian_gradient_magnitude(x, blur, mode="nearest").astype(np.float32)
+            for x in logs
+        )
+        try:
+            warp = cv2.findTransformECC(there, here, warp, cv2.MOTION_HOMOGRAPHY, stop)[1]
+        except cv2.error:  # it does not converge
+            return None
+    place = np.linalg.inv(pixels) @ warp @ pixels
+    corners = np.array([[1, 1, 1], [1, -1, 1], [-1, 1, 1], [-1, -1, 1]]) @ place.T
+    moved = corners[:, :2] / corners[:, 2:] - [[1, 1], [1, -1], [-1, 1], [-1, -1]]
+    return place if np.abs(moved).max() < s.askew else None
 
 
 def find_turn(image: Array, first: Array, s: PlacementSettings = PLACEMENT) -> float:

@@ -49,6 +49,7 @@ class Settings:
     metal_f0: float = 0.3
     f0_range: tuple[float, float] = (0.08, 0.2)  # surely dielectric; surely metal
     metal_start: float = 0.6  # f0 of a metal of which nothing else is known
+    black: float = 0.01  # diffuse albedo, which is nought where a lobe is taken too wide
     metal_better: float = 0.5  # cost of an area's pixels as metal, over that as dielectric, at most
     # Of a sample of which nothing is known: what is tried as if it were flat, with slopes of so
     # little; and the cost, over the least, of what explains the photos about as well.

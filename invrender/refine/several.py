@@ -60,15 +60,15 @@ def by_pattern(patterns: Sequence[Array], known: Array) -> list[int]:
 
 def plain_prior(observations: Sequence[Observation], samples: int, s: Settings = TOGETHER) -> Prior:
     """A flat sample's prior, without what networks say: theirs is of a display's light. Its diffuse
-    albedo is the photos' median, its roughness what explains them; but where bare metal explains
-    the photos of an area better by far, it is that."""
+    albedo is the photos' median, its roughness what explains them; but where bare metal of its hue
+    explains the photos of an area better by far, it is that. What is black has no hue."""
     flat = [flat_maps(o.photo, o.renderer, samples) for o in observations]
     theta = to_theta(flat[0])
     theta[..., D] = np.median([f.diffuse for f in flat], 0)
     photos = [Photo.of(o) for o in observations]
     metal = theta.copy()
-    grey = np.maximum(theta[..., D].mean(-1, keepdims=True), TINY)
-    metal[..., S] = np.clip(theta[..., D] / grey * s.metal_start, 0, 1)
+    colour = theta[..., D] + s.black
+    metal[..., S] = np.clip(colour / colour.mean(-1, keepdims=True) * s.metal_start, 0, 1)
     metal[..., D] = 0
     costs = []
     for trial in (theta, metal):

@@ -21,7 +21,7 @@ from invrender.refine.groups import group
 from invrender.refine.theta import D, R, S
 from invrender.types import Array
 
-TRIED_ROUGHNESS = np.array(PLAIN_ROUGHNESS, np.float32)
+TRIED_ROUGHNESS = np.array((0.06, *PLAIN_ROUGHNESS), np.float32)  # polished stone to chalk
 
 
 @dataclass(frozen=True)

@@ -238,3 +238,13 @@ def test_lamps_alone_measure_dielectrics_and_metals(lamps, kind):
     )
     assert after["normal"] < 0.3 * before["normal"]
     assert after["average"] < 0.5 * before["average"]
+
+
+def test_black_polished_stone_is_not_taken_for_metal(lamps):
+    """Next to no diffuse albedo is left beside too wide a lobe: it has no hue then, and f0 no
+    grounds to be nought."""
+    truth = constant_maps(SIZE, SIZE, 0.004, 0.04, 0.08)
+    truth.diffuse[::3, ::2] *= 3
+    prior = plain_prior(photos_of(truth, lamps), SAMPLES)
+    assert np.all(np.abs(prior.mean[..., 3:6] - 0.04) < 0.01)
+    assert np.median(prior.mean[..., 6]) < 0.2
