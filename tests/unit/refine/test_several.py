@@ -243,7 +243,7 @@ def test_lamps_alone_measure_dielectrics_and_metals(lamps, kind):
 def test_black_polished_stone_is_not_taken_for_metal(lamps):
     """Next to no diffuse albedo is left beside too wide a lobe: it has no hue then, and f0 no
     grounds to be nought."""
-    truth = constant_maps(SIZE, SIZE, 0.004, 0.04, 0.08)
+    truth = constant_maps(8, 8, 0.004, 0.04, 0.08)
     truth.diffuse[::3, ::2] *= 3
     prior = plain_prior(photos_of(truth, lamps), SAMPLES)
     assert np.all(np.abs(prior.mean[..., 3:6] - 0.04) < 0.01)
