@@ -97,7 +97,7 @@ def find_askew(image: Array, first: Array, s: PlacementSettings = PLACEMENT) -> 
 
     n = len(first)
     pixels = np.array([[n / 2, 0, n / 2 - 0.5], [0, -n / 2, n / 2 - 0.5], [0, 0, 1]])
-    warp: Array = np.eye(3, dtype=np.float32)
+    warp: Any = np.eye(3, dtype=np.float32)
     logs = [np.log(x.mean(-1) + s.dark * float(x.mean()) + TINY) for x in (first, image)]
     stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, s.steps, s.settled)
     for blur in s.blurs:
