@@ -114,7 +114,8 @@ def find_lights(
             raise InputError(f"{error}{_fault_of(capture.photo)}") from None
         seen = capture
         capture, mirror = use_reflectance(seen, found)
-        lights, response = _measure(capture, found)
+        printed = None if sheet is None else sheet.printed
+        lights, response = _measure(capture, found, printed=printed)
         if response is not None:
             seen = replace(seen, photo=response.undo(seen.photo))
             found = measure_reflectance(seen.photo, seen.rig, found)
@@ -242,10 +243,10 @@ def measure_lights(capture: Capture, ball: Ball, height: int = UNFOLDING.height)
 
 
 def _measure(
-    capture: Capture, ball: Ball, height: int = UNFOLDING.height
+    capture: Capture, ball: Ball, height: int = UNFOLDING.height, printed: Array | None = None
 ) -> tuple[Lights, Response | None]:
     """The lights, and the photo's tone curve where there is one, in which case the lights are not
-    worth much before that is undone."""
+    worth much before that is undone; printed: of a capture sheet (`FoundSheet`)."""
     if ball.size != (capture.photo.height, capture.photo.width):
         raise InputError("the ball was found in a photo of another size")
     if height < 8 or height % 2:
@@ -255,7 +256,7 @@ def _measure(
     photo = remove_glare(capture.photo, rig, image)
     if not rig.has_screen:
         return _measure_room(capture, photo, rig, image, height), None
-    screen = fit_screen(photo, rig, image, capture.pattern, capture.device)
+    screen = fit_screen(photo, rig, image, capture.pattern, capture.device, printed)
     lit = capture.pattern, screen.gain, screen.device
     fit = _fit_numbers(screen, rig)
     if _shows_another_pattern(screen, ball):

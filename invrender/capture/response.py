@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from invrender.capture.settings import DISPLAY, TONE_CURVE
+from invrender.capture.sheet_layout import INK_DEVIATION, INK_REFLECTANCE, PAPER, PAPER_DEVIATION
 from invrender.files.images import Photo
 from invrender.files.tone_curves import FIXED, KNOTS, curve_prior
 from invrender.sampling import knot_shares
@@ -83,9 +84,21 @@ def curve_shares(values: Array) -> Array:
     return knot_shares(np.log(np.maximum(values, TONE_CURVE.darkest)), LOG_KNOTS)
 
 
-def likely_curves() -> tuple[Array, Array]:
-    """Mean (knots,) and inverse covariance (knots, knots) of the logarithms, of cameras' curves."""
+def likely_curves(printed: Array | None = None) -> tuple[Array, Array]:
+    """Mean (knots,) and inverse covariance (knots, knots) of the logarithms, of cameras' curves.
+
+    printed: (m, 2) values of a capture sheet's ink and of the paper beside it. In the same light
+    paper is so many times as bright as ink, which tells how steep the curve is between them.
+    """
     mean, covariance = curve_prior(np.asarray(KNOTS), FIXED)
     fixed = np.zeros(len(KNOTS))
     fixed[FIXED] = 1 / TONE_CURVE.fixed_deviation**2
-    return mean, np.linalg.inv(covariance) + np.diag(fixed)
+    inverse = np.linalg.inv(covariance) + np.diag(fixed)
+    if printed is None or not len(printed):
+        return mean, inverse
+    ink, paper = (curve_shares(values) for values in printed.T)
+    span = (paper - ink).mean(0)
+    missing = math.log(PAPER / INK_REFLECTANCE) - np.log(printed[:, 1] / printed[:, 0]).mean()
+    weight = 1 / (INK_DEVIATION**2 + (PAPER_DEVIATION / PAPER) ** 2)
+    known = inverse + weight * np.outer(span, span)
+    return np.linalg.solve(known, inverse @ mean + weight * missing * span), known

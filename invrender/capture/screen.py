@@ -66,6 +66,7 @@ def fit_screen(
     image: BallImage,
     pattern: Array,
     device: Device = IDEAL,
+    printed: Array | None = None,
 ) -> Screen:
     """Register the ``pattern`` (h, w, 3), relative radiance, with the ball's image of the screen.
 
@@ -74,10 +75,11 @@ def fit_screen(
     `SCREEN_FIT.poor`, or the screen is saturated, its pose and the display's curve are fitted too;
     where more than `SCREEN_FIT.no_curve` is saturated the curve cannot be told from the gain, and a
     camera's is taken as it usually is. Then what the errors ask for: the display's other
-    properties, and an 8-bit file's tone curve, unless the photo is linear. Raises `InputError` if
+    properties, and an 8-bit file's tone curve, unless the photo is linear; ``printed``, ink and
+    paper of a capture sheet, tells of that (`likely_curves`). Raises `InputError` if
     the ball cannot show the screen, or shows it saturated or dark.
     """
-    fit = _Fit(photo, rig, image, pattern, device)
+    fit = _Fit(photo, rig, image, pattern, device, printed)
     u = fit.start()
     for stage in SCREEN_FIT.stages[-2:]:
         u = fit.solve(u, *stage)
@@ -196,8 +198,9 @@ class _Fit:
     """The ball's image around the screen, the rays that its sub-pixels see, and the fit's steps."""
 
     def __init__(
-        self, photo: Photo, rig: Rig, image: BallImage, pattern: Array, device: Device = IDEAL
-    ) -> None:
+        self, photo: Photo, rig: Rig, image: BallImage, pattern: Array, device: Device = IDEAL,
+        printed: Array | None = None,
+    ) -> None:  # fmt: skip
         self.rig, self.full = rig, pattern
         self.free = np.zeros(_COUNT, bool)
         self.free[_GAIN], self.free[_BLUR] = True, True
@@ -252,7 +255,7 @@ class _Fit:
         deviations[[_FALLOFF, _BLACK]] = DISPLAY.falloff_deviation, DISPLAY.black_deviation
         deviations[_MIXING] = DISPLAY.mixing_deviation
         np.fill_diagonal(self.prior, 1 / deviations**2)
-        self.prior_mean[_CURVE], self.prior[_CURVE, _CURVE] = likely_curves()
+        self.prior_mean[_CURVE], self.prior[_CURVE, _CURVE] = likely_curves(printed)
         self.set_gamma_prior(SCREEN_FIT.gamma_deviation)
         self.focus(0.0)
 

@@ -293,6 +293,7 @@ class SheetFit:
     least_bend: float = 0.5  # pixels by which distortion must move a corner to be undone; by hand
     sure: float = 3.0  # its deviations, likewise; by hand
     largest_off: float = 0.01  # widths by which the photo may grow without black borders; by hand
+    least_module: float = 5.0  # pixels of a marker's module, whose ink is measured; by hand
     patch_points: int = 6  # a side of a square of paper; by hand
     patch_inside: float = 0.6  # of its side; by hand
     patch_noise: float = 0.03  # of its radiance; by hand

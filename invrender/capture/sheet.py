@@ -53,9 +53,9 @@ class FoundSheet:
     x·(1 + k1·r²) with r the tangent of the angle from the axis; each with its deviation. residual:
     of the corners, root mean square in pixels. white: (k, 3) places of plain paper, metres, and
     white_radiance (k, 3) what the photo shows there, at least, where it is white_saturated (k, 3);
-    white_aside: (k,) their squared distance from
-    the optical axis, a corner's being 1. turns: quarters by which the photo was turned,
-    counter-clockwise.
+    white_aside: (k,) their squared distance from the optical axis, a corner's being 1. printed:
+    (m, 2) values of ink and of the paper beside it, of one channel each. turns: quarters by which
+    the photo was turned, counter-clockwise.
     """
 
     ids: NDArray[np.int_]
@@ -73,6 +73,7 @@ class FoundSheet:
     white_radiance: Array
     white_saturated: Mask
     white_aside: Array
+    printed: Array
     turns: int = 0
 
 
@@ -177,9 +178,10 @@ def use_sheet(capture: Capture) -> tuple[Capture, FoundSheet | None, tuple[Notic
     white, radiance, saturated = _white_radiance(
         photo, posed, _rotated(sheet.white, lies), sheet.white_side
     )
+    corners = np.asarray(posed.project(_on_table(places), photo.height, photo.width))
     found = FoundSheet(
         ids=ids,
-        corners=np.asarray(posed.project(_on_table(places), photo.height, photo.width)),
+        corners=corners,
         tilt_deviation=math.degrees(math.hypot(*deviation[3:5])),
         fov=fov,
         fov_deviation=math.degrees(math.sin(math.radians(fov))) * float(deviation[6]),
@@ -195,6 +197,7 @@ def use_sheet(capture: Capture) -> tuple[Capture, FoundSheet | None, tuple[Notic
         white_aside=squared_distance(
             posed.project(_on_table(white), photo.height, photo.width), photo.height, photo.width
         ),
+        printed=_ink_and_paper(photo, corners),
         turns=turns,
     )
     used = replace(
@@ -564,6 +567,33 @@ def _on_table(points: Array) -> Array:
 
 
 # --- the paper ----------------------------------------------------------------------------------
+
+
+def _ink_and_paper(photo: Photo, corners: Array) -> Array:
+    """Values (m, 2) of ink and of the paper beside it, of one channel of one marker each: medians
+    along the middle of its black border, and as far outside. None of markers whose squares are so
+    small that the lens mixes them, or of which something is saturated or outside the photo."""
+    half = 0.5 / MODULES
+    side = np.linalg.norm(corners[:, 1] - corners[:, 0], axis=-1)
+    corners = corners[side > SHEET_FIT.least_module * MODULES]
+    along = np.linspace(half, 1 - half, SHEET_FIT.edge_samples)
+
+    def values(inset: float) -> Array:
+        low, high = np.full_like(along, inset), np.full_like(along, 1 - inset)
+        s = np.concatenate([along, along, low, high])[:, None, None]
+        t = np.concatenate([low, high, along, along])[:, None, None]
+        upper = corners[:, 0] + s * (corners[:, 1] - corners[:, 0])
+        lower = corners[:, 3] + s * (corners[:, 2] - corners[:, 3])
+        column, row = np.floor(upper + t * (lower - upper)).astype(int).transpose(2, 0, 1)
+        inside = (column >= 0) & (column < photo.width) & (row >= 0) & (row < photo.height)
+        seen = photo.image[np.clip(row, 0, photo.height - 1), np.clip(column, 0, photo.width - 1)]
+        seen = np.where(inside[..., None], seen, np.nan)
+        level = math.inf if photo.clip_level is None else photo.clip_level
+        middle = np.asarray(np.median(seen, 0))  # NaN where one is outside
+        return np.where((seen >= level).any(0), np.nan, middle)
+
+    pairs = np.stack([values(half), values(-half)], -1).reshape(-1, 2)
+    return np.asarray(pairs[(pairs > 0).all(1)])
 
 
 def _white_radiance(photo: Photo, rig: Rig, white: Array, side: float) -> tuple[Array, Array, Mask]:

@@ -20,6 +20,8 @@ from invrender.types import Array, InputError
 PAPER = 0.80  # reflectance of plain office paper
 PAPER_DEVIATION = 0.05  # of that, from one paper to another
 INK_REFLECTANCE = 0.05  # reflectance of a printer's black, about
+# Of its logarithm: blacks on plain paper have optical densities of 1.15 to 1.45; by hand.
+INK_DEVIATION = 0.25
 # What A4 and Letter, or A3 and Ledger, have in common, metres: one sheet fits on either.
 PAPERS = {"A4 or Letter": (0.2794, 0.210), "A3 or Ledger": (0.4191, 0.2794)}
 UNPRINTED = 0.006  # metres along the paper's edges where printers may leave nothing
@@ -168,8 +170,9 @@ def marker_bits(ids: NDArray[np.int_]) -> NDArray[np.int_]:
     return np.asarray(bits, int) // 255
 
 
-def draw_sheet(sheet: Sheet, resolution: float) -> Array:
-    """The sheet's reflectance (H, W), float32, ``resolution`` pixels a metre, row 0 at +y.
+def draw_sheet(sheet: Sheet, resolution: float, ink: float = INK_REFLECTANCE) -> Array:
+    """The sheet's reflectance (H, W), float32, ``resolution`` pixels a metre, row 0 at +y; ink: that
+    of what is printed.
 
     It covers ``sheet.page``, each pixel the mean over its square; the window is plain paper.
 
@@ -187,7 +190,7 @@ def draw_sheet(sheet: Sheet, resolution: float) -> Array:
         down = _shares(-rows[v0 : v1 + 1], np.linspace(-top, -bottom, MODULES + 1))
         across = _shares(columns[u0 : u1 + 1], np.linspace(left, right, MODULES + 1))
         black = down @ (1 - bits) @ across.T
-        image[v0 : v0 + len(black), u0 : u0 + black.shape[1]] -= (PAPER - INK_REFLECTANCE) * black
+        image[v0 : v0 + len(black), u0 : u0 + black.shape[1]] -= (PAPER - ink) * black
     return image
 
 

@@ -147,7 +147,7 @@ def _light(
     cover = None
     if setup.sheet:
         sheet = capture_sheet(setup.nominal)
-        cover = draw_sheet(sheet, SHEET_PIXELS), sheet.page
+        cover = draw_sheet(sheet, SHEET_PIXELS, setup.ink), sheet.page
     return photograph(
         replace(rig, fov=fov), maps, pattern, environment, setup.gain, height=high, width=wide,
         spp=spp, seed=seed + k, device=setup.device, ball=setup.ball, ball_alpha=setup.ball_alpha,

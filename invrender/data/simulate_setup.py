@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from invrender.capture.sheet_layout import INK_REFLECTANCE
 from invrender.data.simulate_camera import HALF_WIDTH, Camera
 from invrender.data.tablets import find_tablet
 from invrender.lights import IDEAL, Device, Lamp
@@ -48,6 +49,7 @@ RANGES = {
     "screen_tilt": Range(-3.0, 3.0, "hand: display's tilt about each axis, degrees"),
     "sample": Range(0.05, 0.08, "sample: its side, metres"),
     "table": Range(0.05, 0.6, "table: albedo", True),
+    "ink": Range(0.035, 0.07, "sheet: reflectance of its ink", True),
     "reflectance": Range(0.45, 0.9, "ball: reflectance"),
     "reflectance_rgb": Range(0.95, 1.05, "the same: factor of each channel"),
     "ball_alpha": Range(0.0, 0.02, "ball: roughness alpha"),
@@ -92,7 +94,7 @@ class Setup:
 
     rig: the true one; nominal: what a person would write into rig.toml. gain: RGB radiance of the
     display's white. ball: its centre in the world, metres; ball_alpha: its roughness. table: RGB
-    albedo. sheet: whether the printed capture sheet lies on it. photos: "raw", "bracket" or "jpeg";
+    albedo. sheet: whether the printed capture sheet lies on it; ink: reflectance of its black. photos: "raw", "bracket" or "jpeg";
     exposures: of each photo, by what it is exposed for: "sample", "middle" or "screen". shakes: by
     how much the camera moves from the first photo to each, (metres, degrees). lamps: of a set-up
     without a screen one for each photo.
@@ -111,6 +113,7 @@ class Setup:
     exposures: tuple[str, ...] = ("screen",)
     shakes: tuple[tuple[Vec3, Vec3], ...] = (((0.0,) * 3, (0.0,) * 3),)
     lamps: tuple[Lamp, ...] = ()
+    ink: float = INK_REFLECTANCE
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -185,7 +188,7 @@ def draw_setup(
     return Setup(
         rig, nominal, _device(draw), _vec3(gain * np.array(tint)), _vec3(ball),
         draw("ball_alpha"), _vec3(np.minimum(table * np.array(paint), 0.9)), sheet, camera,
-        photos, for_what, tuple(shakes), draw_lamps(seed, lamps),
+        photos, for_what, tuple(shakes), draw_lamps(seed, lamps), draw("ink"),
     )  # fmt: skip
 
 

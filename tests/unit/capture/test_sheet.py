@@ -10,6 +10,7 @@ from sheet_photo import irradiance, sheet_photo
 
 from invrender.capture.lights import find_lights
 from invrender.capture.mirror import make_ball
+from invrender.capture.response import LOG_KNOTS, likely_curves
 from invrender.capture.sheet import (
     _Camera,
     _fit,
@@ -19,7 +20,7 @@ from invrender.capture.sheet import (
     use_paper,
     use_sheet,
 )
-from invrender.capture.sheet_layout import capture_sheet
+from invrender.capture.sheet_layout import INK_REFLECTANCE, PAPER, capture_sheet
 from invrender.capture.table import room_irradiance, screen_irradiance
 from invrender.files.capture import Capture
 from invrender.files.images import Photo
@@ -54,6 +55,32 @@ OPTICS = {"k1": -0.05, "centre": (0.004, -0.003)}
 @pytest.fixture(scope="module")
 def bent():
     return sheet_photo(HELD, *SIZE, **OPTICS)
+
+
+# --- ink and paper ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ink", [0.04, 0.06])
+def test_ink_and_paper_tell_how_steep_a_tone_curve_is(image, ink):
+    printed = use_sheet(captured(image))[1].printed
+    ratio = float(np.median(printed[:, 1] / printed[:, 0]))  # the lens mixes a little
+    assert ratio == pytest.approx(PAPER / INK_REFLECTANCE, 0.12)
+    paper = 0.6 * printed[:, 1] / printed.max()
+    light = np.stack([paper * ink / PAPER, paper], -1)
+    values = 2.3 * light / (1 + 1.3 * light)  # a strong shoulder (Reinhard)
+
+    def error(curve):  # of the light on paper over that on ink, a logarithm
+        log = np.log(values) + np.interp(np.log(values), LOG_KNOTS, curve)
+        return abs(np.diff(log - np.log(light), axis=-1).mean())
+
+    usual, told = likely_curves()[0], likely_curves(values)[0]
+    assert error(usual) > 0.4 and error(told) < 0.6 * error(usual)
+
+
+def test_ink_is_not_measured_where_paper_is_saturated(image):
+    level = float(np.median(use_sheet(captured(image))[1].printed[:, 1]))
+    clipped = use_sheet(captured(np.minimum(image, level), clip=level))[1].printed
+    assert len(clipped) and clipped.max() < level
 
 
 # --- the camera ---------------------------------------------------------------------------------

@@ -28,7 +28,7 @@ def sheet_of(rig, count):
     empty = np.zeros((0, 3))
     return FoundSheet(
         sheet.ids[:count], corners[:count], 0.02, 73.7, 0.3, (5e-4, 5e-4, 8e-4), (0.0, 0.0),
-        (1e-3, 1e-3), 0.0, 1e-3, 0.1, empty, empty, empty > 0, np.zeros(0),
+        (1e-3, 1e-3), 0.0, 1e-3, 0.1, empty, empty, empty > 0, np.zeros(0), np.zeros((0, 2)),
     )  # fmt: skip
 
 
