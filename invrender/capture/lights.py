@@ -364,6 +364,7 @@ def _fit_numbers(screen: Screen, rig: Rig) -> dict[str, float]:
         "gain_deviation": screen.gain_deviation,
         "gamma": float(np.mean(screen.device.gamma)),
         "falloff": screen.device.falloff,
+        "falloff_deviation": screen.falloff_deviation,
         "blur": screen.blur,
         "pixels": float(screen.pixels),
         "saturated": screen.saturated,

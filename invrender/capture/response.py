@@ -87,8 +87,8 @@ def curve_shares(values: Array) -> Array:
 def likely_curves(printed: Array | None = None) -> tuple[Array, Array]:
     """Mean (knots,) and inverse covariance (knots, knots) of the logarithms, of cameras' curves.
 
-    printed: (m, 2) values of a capture sheet's ink and of the paper beside it. In the same light
-    paper is so many times as bright as ink, which tells how steep the curve is between them.
+    printed: (m, 2) values of a capture sheet's ink and of the paper beside it. In any light paper
+    is as many times as bright as ink, and about so many, which tells how steep the curve is.
     """
     mean, covariance = curve_prior(np.asarray(KNOTS), FIXED)
     fixed = np.zeros(len(KNOTS))
@@ -97,8 +97,10 @@ def likely_curves(printed: Array | None = None) -> tuple[Array, Array]:
     if printed is None or not len(printed):
         return mean, inverse
     ink, paper = (curve_shares(values) for values in printed.T)
-    span = (paper - ink).mean(0)
-    missing = math.log(PAPER / INK_REFLECTANCE) - np.log(printed[:, 1] / printed[:, 0]).mean()
-    weight = 1 / (INK_DEVIATION**2 + (PAPER_DEVIATION / PAPER) ** 2)
-    known = inverse + weight * np.outer(span, span)
-    return np.linalg.solve(known, inverse @ mean + weight * missing * span), known
+    paper_over_ink = printed[:, 1] / printed[:, 0]
+    spans, missing = paper - ink, math.log(PAPER / INK_REFLECTANCE) - np.log(paper_over_ink)
+    alike = INK_DEVIATION**2 + (PAPER_DEVIATION / PAPER) ** 2
+    apart = TONE_CURVE.ink_noise**2 * max(1, len(printed) / TONE_CURVE.independent)
+    weight = np.linalg.inv(apart * np.eye(len(printed)) + alike)
+    known = inverse + spans.T @ weight @ spans
+    return np.linalg.solve(known, inverse @ mean + spans.T @ weight @ missing), known

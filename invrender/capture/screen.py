@@ -43,7 +43,8 @@ class Screen:
     taken as straight. ``blur`` is the camera's in pixels, ``residual`` the fit's RMS over the mean
     gain, ``ideal_residual`` that of the screen as it should be, ``deviation`` the standard
     deviations that the fit expects of the shift (metres) and the tilt (degrees),
-    ``gain_deviation`` that of the logarithm of the screen's light, ``pixels`` the number that lie
+    ``gain_deviation`` that of the logarithm of the screen's light, ``falloff_deviation`` that of
+    the display's falloff, nought where it is taken as it should be, ``pixels`` the number that lie
     on the screen and are not saturated, ``saturated`` the share that is.
     """
 
@@ -56,6 +57,7 @@ class Screen:
     ideal_residual: float
     deviation: tuple[float, float]
     gain_deviation: float
+    falloff_deviation: float
     pixels: int
     saturated: float
 
@@ -89,6 +91,8 @@ def fit_screen(
     if fit.curved_file and ideal.saturated >= SCREEN_FIT.no_curve:
         fit.hidden = True
         ideal = fit.result(u)
+    if ideal.saturated >= SCREEN_FIT.no_curve and device == IDEAL:
+        fit.assume_falloff()
     fit.free[:_COLOUR] = True
     fit.free[_GAMMA] = ideal.saturated < SCREEN_FIT.no_display
     if ideal.saturated >= SCREEN_FIT.no_curve:
@@ -207,6 +211,7 @@ class _Fit:
         self.free[_COLOUR] = self.coded = photo.clip_level is not None
         self.curved_file = self.coded and not photo.linear
         self.asked, self.hidden, self.undone = False, False, photo.curve_deviation
+        self.assumed = False
         ball = image.ball
         self.step = step = max(1, round(ball.radius / SCREEN_FIT.finest))
         self.radius = ball.radius / step
@@ -263,6 +268,12 @@ class _Fit:
         """The deviation of the display's log gamma, of the channels' mean."""
         apart = _APART / SCREEN_FIT.channel_deviation**2
         self.prior[_GAMMA, _GAMMA] = apart + 1 / 9 / deviation**2
+
+    def assume_falloff(self) -> None:
+        """Let the display dim to the sides as displays do."""
+        self.prior_mean[_FALLOFF] = DISPLAY.usual_falloff
+        self.prior[_FALLOFF, _FALLOFF] = 1 / DISPLAY.usual_deviation**2
+        self.assumed = True
 
     def focus(self, blurred: float) -> None:
         """Take the image ``blurred`` further for what follows."""
@@ -683,6 +694,7 @@ class _Fit:
                 float(np.linalg.norm(spread[3:])) * SCREEN_FIT.tilt_deviation,
             ),
             gain_deviation=self.gain_deviation(u, covariance),
+            falloff_deviation=self.falloff_deviation(covariance),
             pixels=int(unclipped.sum()) * self.step**2,
             saturated=float(1 - unclipped.sum() / max(inside.sum(), 1)),
         )
@@ -718,10 +730,19 @@ class _Fit:
             unknown = float(span @ self.prior_mean[_CURVE])
         return math.hypot(fitted, unknown, self.undone)
 
+    def falloff_deviation(self, covariance: Array) -> float:
+        """Of the display's falloff, where it is fitted or assumed."""
+        usual = DISPLAY.usual_deviation if self.assumed else 0.0
+        if not self.free[_FALLOFF]:
+            return usual
+        fitted = SCREEN_FIT.correlated * math.sqrt(covariance[_FALLOFF, _FALLOFF])
+        return min(fitted, usual) if self.assumed else fitted
+
     def curve_span(self, u: Array) -> Array:
         """What each knot of a tone curve adds to the logarithm of the screen's light over the
         sample's, which is so much darker."""
         white = np.exp(u[_GAIN]).mean(keepdims=True) * self.reflectance.mean()
+        white = np.minimum(white, 1.0)  # the file's own, where the screen is brighter than that
         return curve_shares(white)[0] - curve_shares(DISPLAY.sample * white)[0]
 
     def usual_deviation(self, span: Array) -> float:

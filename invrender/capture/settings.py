@@ -477,6 +477,9 @@ class Display:
 
     falloff_deviation: float = 1.0  # of the exponent; measured displays have 0.3 to 1.6
     greatest_falloff: float = 3.0  # of any; by hand
+    # Where the screen is too saturated to tell: the middle of those, and the deviation.
+    usual_falloff: float = 0.95
+    usual_deviation: float = 0.4
     black_deviation: float = 0.01  # relative to white; by hand
     mixing_deviation: float = 0.05  # of a channel's light in another; measured: 0.01 to 0.09
     # Of the logarithm of the display's gamma; measured displays have gammas of 0.92 to 1.12.
@@ -497,6 +500,9 @@ class ToneCurve:
     fixed_deviation: float = 1e-3  # of the fixed knot's logarithm; by hand
     darkest: float = 1e-6  # linear; by hand
     least_slope: float = 0.1  # of the whole curve, in logarithms, that can be undone; by hand
+    # Of the logarithm of paper over ink, from marker to marker; markers that are independent; by hand.
+    ink_noise: float = 0.05
+    independent: float = 30.0
     parts: int = 16  # of a photo, one after the other, to save memory; by hand
 
 

@@ -21,7 +21,13 @@ from invrender.capture.ball_image import sample_image
 from invrender.capture.camera import is_whole
 from invrender.capture.mirror import Ball
 from invrender.capture.response import Response
-from invrender.capture.settings import CLIPPED_LAMPS, GAUSSIAN_SPREAD, SCREEN_FIT, SHEET_FIT
+from invrender.capture.settings import (
+    CLIPPED_LAMPS,
+    DISPLAY,
+    GAUSSIAN_SPREAD,
+    SCREEN_FIT,
+    SHEET_FIT,
+)
 from invrender.capture.sheet_layout import (
     FAMILY,
     MODULES,
@@ -622,11 +628,12 @@ def undone(sheet: FoundSheet | None, response: Response) -> FoundSheet | None:
 
 @dataclass(frozen=True)
 class PaperLight:
-    """The light that the paper shows: the screen's ``gain`` (3,), and factors on what the ball
-    shows of the room and, (3,), on what is guessed of it. ``deviation``: of the logarithm of the
-    gain's mean; ``light``: of that of all light on the paper."""
+    """The light that the paper shows: the screen's ``gain`` (3,) and ``falloff``, and factors on
+    what the ball shows of the room and, (3,), on what is guessed of it. ``deviation``: of the
+    logarithm of the gain's mean; ``light``: of that of all light on the paper."""
 
     gain: Array
+    falloff: float
     room: float
     lamps: Array
     deviation: float
@@ -643,7 +650,7 @@ def light_on_paper(found: FoundSheet, lights: Lights, doubt: float = math.inf) -
 
     ``lights`` has the pattern, the gain by the ball, of which ``doubt`` is the logarithm's
     deviation (infinite: it is not asked), and the room, whose ``lamps`` are a guess. A factor on
-    each, what the lens loses towards the corners and the paper's own reflectance are fitted
+    each, how the display dims to the sides, as far as that is in doubt, what the lens loses towards the corners and the paper's own reflectance are fitted
     together, under log-normal priors. Saturated paper has at least the light that the photo shows:
     without it, the rest would be taken as all, which lies in shadows. None where too little paper
     is to be seen.
@@ -654,9 +661,19 @@ def light_on_paper(found: FoundSheet, lights: Lights, doubt: float = math.inf) -
     cells = SHEET_FIT.screen_cells
     guessed = np.zeros_like(lights.environment) if lights.lamps is None else lights.lamps
     given = np.maximum(np.broadcast_to(np.asarray(lights.gain, float), 3), TINY)
-    screen = screen_irradiance(
-        lights.rig, found.white, (lights.pattern, given, lights.device), cells
-    )
+    dims, doubted = lights.device.falloff, lights.fit.get("falloff_deviation", 0.0)
+    places = np.append(found.white, [lights.rig.ball_centre * [1, 1, 0]], 0)
+
+    def shown(falloff: float) -> Array:
+        device = replace(lights.device, falloff=falloff)
+        return screen_irradiance(lights.rig, places, (lights.pattern, given, device), cells)
+
+    screen, less = shown(dims)[:-1], 0.0
+    steps = np.zeros_like(screen)
+    if doubted:  # of the logarithm by a deviation of the falloff, which the ball's image stays with
+        low = max(dims - doubted, 0.0)
+        steps = np.log(shown(dims + doubted) / shown(low)) * (doubted / (dims + doubted - low))
+        steps, less = steps[:-1] - steps[-1], steps[-1]
     rows = SHEET_FIT.environment_rows
     room, lamps = (
         room_irradiance(lights.rig, found.white, resample_environment(light, rows))
@@ -669,7 +686,7 @@ def light_on_paper(found: FoundSheet, lights: Lights, doubt: float = math.inf) -
     # Unknowns: logarithms of the screen's factors, the room's, the lamps' and the paper's;
     # vignetting.
     def errors(x: Array) -> Array:
-        bright = screen * np.exp(x[:3]) + room * np.exp(x[3]) + lamps * np.exp(x[4:7])
+        bright = screen * np.exp(x[:3] + steps * x[9]) + room * np.exp(x[3]) + lamps * np.exp(x[4:7])
         lens = lens_gain(min(x[8], SHEET_FIT.most_vignetting), found.white_aside)
         off = (bright * np.exp(x[7]) / lens[:, None] - seen) * weight
         off = np.where(full, np.minimum(off, 0), off)
@@ -683,18 +700,22 @@ def light_on_paper(found: FoundSheet, lights: Lights, doubt: float = math.inf) -
             *((x[4:7] - x[4:7].mean()) / CLIPPED_LAMPS.channel_deviation),
             x[7] / (PAPER_DEVIATION / PAPER),
             x[8] / SHEET_FIT.vignetting_deviation,
+            x[9],
         )
         return np.append(off.ravel(), prior)
 
-    done = least_squares(errors, np.zeros(9))
+    done = least_squares(errors, np.zeros(10))
     covariance = np.linalg.pinv(done.jac.T @ done.jac)
-    factors = np.exp(done.x)
-    by = np.zeros(9)
+    factors, off = np.exp(done.x), float(done.x[9])
+    screen = screen * np.exp(steps * off)
+    by = np.zeros(10)
+    by[9] = (screen * steps).mean(0) @ factors[:3]
     by[:3], by[4:7] = screen.mean(0) * factors[:3], lamps.mean(0) * factors[4:7]
     by[3] = room.mean(0).sum() * factors[3]
-    by /= by.sum()
+    by /= by[:7].sum()
     return PaperLight(
-        given * factors[:3],
+        given * factors[:3] * np.exp(-less * off),
+        float(np.clip(dims + off * doubted, 0, DISPLAY.greatest_falloff)),
         float(factors[3]),
         factors[4:7],
         float(np.sqrt(covariance[:3, :3].mean())),
@@ -759,6 +780,7 @@ def use_paper(
 def _with_light(lights: Lights, paper: PaperLight) -> Lights:
     """The lights as bright as the paper shows them."""
     gain = paper.gain.astype(np.float32)
+    lights = replace(lights, device=replace(lights.device, falloff=paper.falloff))
     if lights.lamps is None:
         return replace(lights, gain=gain)
     lamps = lights.lamps * paper.lamps.astype(np.float32)
