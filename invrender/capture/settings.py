@@ -500,9 +500,8 @@ class ToneCurve:
     fixed_deviation: float = 1e-3  # of the fixed knot's logarithm; by hand
     darkest: float = 1e-6  # linear; by hand
     least_slope: float = 0.1  # of the whole curve, in logarithms, that can be undone; by hand
-    # Of the logarithm of paper over ink, from marker to marker; markers that are independent; by hand.
-    ink_noise: float = 0.05
-    independent: float = 30.0
+    ink_noise: float = 0.05  # of log paper over ink, from marker to marker; by hand
+    independent: float = 30.0  # such measurements that are, at most; by hand
     parts: int = 16  # of a photo, one after the other, to save memory; by hand
 
 

@@ -650,10 +650,10 @@ def light_on_paper(found: FoundSheet, lights: Lights, doubt: float = math.inf) -
 
     ``lights`` has the pattern, the gain by the ball, of which ``doubt`` is the logarithm's
     deviation (infinite: it is not asked), and the room, whose ``lamps`` are a guess. A factor on
-    each, how the display dims to the sides, as far as that is in doubt, what the lens loses towards the corners and the paper's own reflectance are fitted
-    together, under log-normal priors. Saturated paper has at least the light that the photo shows:
-    without it, the rest would be taken as all, which lies in shadows. None where too little paper
-    is to be seen.
+    each, how the display dims to the sides, as far as that is in doubt, what the lens loses towards
+    the corners and the paper's own reflectance are fitted together, under log-normal priors.
+    Saturated paper has at least the light that the photo shows: without it, the rest would be taken
+    as all, which lies in shadows. None where too little paper is to be seen.
     """
     full = found.white_saturated
     if clear_squares(found) < SHEET_FIT.least_patches:
@@ -686,7 +686,9 @@ def light_on_paper(found: FoundSheet, lights: Lights, doubt: float = math.inf) -
     # Unknowns: logarithms of the screen's factors, the room's, the lamps' and the paper's;
     # vignetting.
     def errors(x: Array) -> Array:
-        bright = screen * np.exp(x[:3] + steps * x[9]) + room * np.exp(x[3]) + lamps * np.exp(x[4:7])
+        bright = (
+            screen * np.exp(x[:3] + steps * x[9]) + room * np.exp(x[3]) + lamps * np.exp(x[4:7])
+        )
         lens = lens_gain(min(x[8], SHEET_FIT.most_vignetting), found.white_aside)
         off = (bright * np.exp(x[7]) / lens[:, None] - seen) * weight
         off = np.where(full, np.minimum(off, 0), off)

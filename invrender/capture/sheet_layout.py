@@ -171,8 +171,8 @@ def marker_bits(ids: NDArray[np.int_]) -> NDArray[np.int_]:
 
 
 def draw_sheet(sheet: Sheet, resolution: float, ink: float = INK_REFLECTANCE) -> Array:
-    """The sheet's reflectance (H, W), float32, ``resolution`` pixels a metre, row 0 at +y; ink: that
-    of what is printed.
+    """The sheet's reflectance (H, W), float32, ``resolution`` pixels a metre, row 0 at +y;
+    ink: that of what is printed.
 
     It covers ``sheet.page``, each pixel the mean over its square; the window is plain paper.
 

@@ -94,10 +94,10 @@ class Setup:
 
     rig: the true one; nominal: what a person would write into rig.toml. gain: RGB radiance of the
     display's white. ball: its centre in the world, metres; ball_alpha: its roughness. table: RGB
-    albedo. sheet: whether the printed capture sheet lies on it; ink: reflectance of its black. photos: "raw", "bracket" or "jpeg";
-    exposures: of each photo, by what it is exposed for: "sample", "middle" or "screen". shakes: by
-    how much the camera moves from the first photo to each, (metres, degrees). lamps: of a set-up
-    without a screen one for each photo.
+    albedo. sheet: whether the printed capture sheet lies on it; ink: reflectance of its black.
+    photos: "raw", "bracket" or "jpeg"; exposures: of each photo, by what it is exposed for:
+    "sample", "middle" or "screen". shakes: by how much the camera moves from the first photo to
+    each, (metres, degrees). lamps: of a set-up without a screen one for each photo.
     """
 
     rig: Rig
