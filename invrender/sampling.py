@@ -42,6 +42,16 @@ def resize_weights(old: int, new: int) -> csr_array:
     return csr_array((values, column.ravel(), start), shape=(new, old))
 
 
+def means_of_blocks(image: Array, step: int, dtype: Any = None) -> Array:
+    """Means over ``step`` × ``step`` pixels of (H, W, ...); what is left over at the right and the
+    lower border is dropped."""
+    h, w = (n // step for n in image.shape[:2])
+    # Rows first: numpy's mean over two axes apart takes five times as long.
+    rows = image[: h * step, : w * step].reshape(h, step, w * step, *image.shape[2:])
+    means = rows.mean(1, dtype=dtype).reshape(h, w, step, *image.shape[2:]).mean(2, dtype=dtype)
+    return np.asarray(means)
+
+
 def centres(n: int, of: int) -> NDArray[np.intp]:
     """Which of ``of`` pixels hold the centres of n that span the same length."""
     return ((np.arange(n) + 0.5) / n * of).astype(np.intp)

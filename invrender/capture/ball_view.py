@@ -16,6 +16,7 @@ from invrender.capture.mirror import ball_centre, horizon_points, outline_points
 from invrender.capture.settings import BALL_VIEW
 from invrender.files.images import Photo
 from invrender.rig import Rig
+from invrender.sampling import means_of_blocks
 from invrender.types import TINY, Array
 
 
@@ -41,16 +42,12 @@ class View:
     @cached_property
     def levels(self) -> Array:
         """The image ever more blurred, (5, h, w, 3)."""
-        blurred = [
-            ndimage.gaussian_filter(self.image, (a, a, 0), mode="nearest") for a in BALL_VIEW.blurs
-        ]
-        return np.stack(blurred).astype(np.float32)
+        return np.stack([_smooth(self.image, sigma) for sigma in BALL_VIEW.blurs])
 
     @cached_property
     def tensor(self) -> Array:
         """The structure tensor of the tone summed over the channels, (h, w, 3): xx, xy, yy."""
-        blur = (BALL_VIEW.tensor_blur, BALL_VIEW.tensor_blur, 0)
-        smooth = ndimage.gaussian_filter(self.tone, blur, mode="nearest")
+        smooth = _smooth(self.tone, BALL_VIEW.tensor_blur)
         gy, gx = (
             ndimage.correlate1d(smooth, [-0.5, 0, 0.5], axis=a, mode="nearest") for a in (0, 1)
         )
@@ -72,17 +69,24 @@ class View:
         return rig.rays(positions * self.step + self.origin, *self.size)
 
 
+def _smooth(image: Array, sigma: float) -> Array:
+    """A Gaussian over an image (h, w, 3), the border repeated."""
+    import cv2  # SciPy takes five times as long
+
+    size = 2 * round(4 * sigma) + 1
+    image = image.astype(np.float32)
+    return np.asarray(
+        cv2.GaussianBlur(image, (size, size), sigma, None, sigma, cv2.BORDER_REPLICATE)
+    )
+
+
 def view_around(photo: Photo, middle: Array, reach: float, shrink: float) -> View:
     """The photo within ``reach`` pixels of ``middle`` (x, y), shrunk about ``shrink`` times."""
     step = max(1, round(shrink))
     low = np.maximum(np.floor(middle - reach), 0).astype(int)
     high = np.minimum(np.ceil(middle + reach), [photo.width, photo.height]).astype(int)
-    count = np.maximum((high - low) // step, 1)
-    high = low + count * step
-    part = photo.image[low[1] : high[1], low[0] : high[0]]
-    # Rows first: numpy's mean over two of five axes takes five times as long.
-    rows = part.reshape(count[1], step, -1, 3).mean(1)
-    part = rows.reshape(count[1], count[0], step, 3).mean(2)
+    high = low + np.maximum((high - low) // step, 1) * step
+    part = means_of_blocks(photo.image[low[1] : high[1], low[0] : high[0]], step)
     level = max(float(np.median(part)), BALL_VIEW.least_level * float(part.max()), TINY)
     white = min((photo.clip_level or math.inf) / level, BALL_VIEW.brightest)
     image = np.minimum(part / level, BALL_VIEW.brightest)

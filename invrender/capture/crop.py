@@ -11,6 +11,7 @@ from scipy import ndimage
 from invrender.capture.settings import CROP
 from invrender.files.images import Photo
 from invrender.rig import Rig
+from invrender.sampling import means_of_blocks
 from invrender.types import Array, InputError, Mask
 
 
@@ -74,8 +75,7 @@ def crop_part(
         at = np.stack([pixels[..., 1] - y0 - 0.5, pixels[..., 0] - x0 - 0.5]) + margin
         for c, plane in enumerate(planes):
             fine = ndimage.map_coordinates(plane, at, order=order, mode="nearest", prefilter=False)
-            mean = fine.reshape(-1, samples, size, samples).mean((1, 3))
-            out[band, :, c] = np.maximum(mean, 0)
+            out[band, :, c] = np.maximum(means_of_blocks(fine, samples), 0)
     return out
 
 

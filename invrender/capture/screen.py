@@ -30,7 +30,7 @@ from invrender.files.images import Photo
 from invrender.files.tone_curves import KNOTS
 from invrender.lights import GAMMAS, IDEAL, STEEPEST_FALLOFF, Device
 from invrender.rig import Rig
-from invrender.sampling import resize_pattern
+from invrender.sampling import means_of_blocks, resize_pattern
 from invrender.types import TINY, Array, InputError
 
 
@@ -173,7 +173,7 @@ def _look_up(image: Array, s: Array, t: Array, slopes: bool) -> list[Array]:
     i, j = y.astype(int), x.astype(int)
     fy, fx = y - i, x - j
     planes, k = np.moveaxis(image, -1, 0).reshape(3, n * n), i * n + j
-    corners = [planes[:, k + d] for d in (0, 1, n, n + 1)]
+    corners = [planes.take(k + d, 1) for d in (0, 1, n, n + 1)]
     top, bottom = (a + fx * (b - a) for a, b in (corners[:2], corners[2:]))
     out = [top + fy * (bottom - top)]
     if slopes:
@@ -219,11 +219,11 @@ class _Fit:
         rows, columns = self._area(rig, image, step)
         area = photo.image[rows, columns]
         h, w = area.shape[0] // step, area.shape[1] // step
-        pool = area[: h * step, : w * step].reshape(h, step, w, step, 3)
+        area = area[: h * step, : w * step]
         self.reflectance = reflectance = np.asarray(rig.ball_reflectance, np.float32)
-        self.observed = pool.mean((1, 3), dtype=float) / reflectance
+        self.observed = means_of_blocks(area, step, float) / reflectance
         self.level = np.full(3, photo.clip_level or np.inf) / reflectance
-        self.saturated = pool.max((1, 3)) / reflectance >= self.level
+        self.saturated = area.reshape(h, step, w, step, 3).max((1, 3)) / reflectance >= self.level
         # What a file's white cuts off is cut off before colours are blurred.
         top = self.observed.max((0, 1))
         self.white = np.where(top >= self.level, top, math.inf)

@@ -13,7 +13,7 @@ from invrender.capture.settings import TABLE_METER
 from invrender.files.images import Photo
 from invrender.lights import Device
 from invrender.rig import Rig
-from invrender.sampling import resize_pattern
+from invrender.sampling import means_of_blocks, resize_pattern
 from invrender.sphere import resample_environment, sky_flux
 from invrender.types import Array, Mask
 
@@ -56,7 +56,7 @@ def table_blocks(photo: Photo, rig: Rig, ball: Ball) -> tuple[Array, Array, Mask
     h, w = photo.height // (k * step), photo.width // (k * step)
 
     some = photo.image[step // 2 :: step, step // 2 :: step][: h * k, : w * k]
-    mean = some.reshape(h, k, w, k, 3).mean((1, 3))
+    mean = means_of_blocks(some, k)
     clipped = replace(photo, image=some).clipped.reshape(h, k, w, k).any((1, 3))
     block = k * step
     centre = np.stack(np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5), -1) * block

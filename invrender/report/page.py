@@ -21,6 +21,7 @@ from PIL import Image
 from invrender.colour import linear_to_srgb
 from invrender.maps import Maps
 from invrender.report.report import Report
+from invrender.sampling import means_of_blocks
 from invrender.sphere import irradiance
 from invrender.types import Array
 
@@ -248,9 +249,7 @@ def block_means(image: Array, largest: int) -> Array:
     step = -(-max(image.shape[:2]) // largest)
     if step == 1:
         return image
-    h, w = (n // step * step for n in image.shape[:2])
-    blocks = image[:h, :w].reshape(h // step, step, w // step, step, *image.shape[2:])
-    return np.asarray(blocks.mean((1, 3), dtype=np.float32))
+    return means_of_blocks(image, step, np.float32)
 
 
 def to_bytes(image: Array) -> NDArray[np.uint8]:
