@@ -136,10 +136,11 @@ def _codes(path: Path, image: ImageFile, kind: str, boxes: Picture) -> tuple[Any
 
 
 def _array(im: Image.Image) -> NDArray[np.uint8]:
-    """(H, W) or (H, W, C) codes; a few rows at once, since Pillow makes two copies."""
+    """(H, W) or (H, W, C) codes; few rows at once: Pillow makes two copies, and memory that is new
+    to a process takes more time than to fill it."""
     channels = len(im.getbands())
     codes = np.empty((im.height, im.width, channels)[: 3 if channels > 1 else 2], np.uint8)
-    rows = 256
+    rows = 64
     for top in range(0, im.height, rows):
         part = codes[top : top + rows]
         part[:] = np.asarray(im.crop((0, top, im.width, top + len(part))))
