@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -200,11 +201,13 @@ def decode(
         return np.ascontiguousarray(stored.repeat(3, -1) if grey else stored[..., :3], np.float32)
     # A few rows stay in the processor's caches; what sets up a transform each time gets many.
     rows = 8 if e.convert is None else 256
-    band = np.empty((rows * reduction, stored.shape[1], 3), np.float32)
-    for top in range(0, height, rows):
+
+    def fill(top: int) -> None:
         target = image[top : top + rows]
         part = slice(top * reduction, (top + len(target)) * reduction)
-        light = target if reduction == 1 else band[: len(target) * reduction]
+        light = target
+        if reduction > 1:
+            light = np.empty((len(target) * reduction, stored.shape[1], 3), np.float32)
         _to_light(raster, table, stored[part], light, data)
         if alpha is not None:
             factor = alpha[part, :, None]
@@ -220,6 +223,10 @@ def decode(
                 full |= part_of >= saturated
             target /= reduction * reduction
             target[full] = np.maximum(target[full], np.float32(saturated))
+
+    # In two threads: most of the time, the system finds memory that is new to the process.
+    with ThreadPoolExecutor(1 if e.convert else 2) as both:
+        list(both.map(fill, range(0, height, rows)))
     return image
 
 
