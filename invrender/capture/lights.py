@@ -120,7 +120,7 @@ def find_lights(
             seen = replace(seen, photo=response.undo(seen.photo))
             found = measure_reflectance(seen.photo, seen.rig, found)
             capture, mirror = use_reflectance(seen, found)
-            lights, _ = _measure(capture, found)
+            lights, _ = _measure(capture, found, printed=printed)
             usual = USUAL_CURVE_TEXT.format(response.deviation)
             text = CURVE_TEXT if response.measured else usual
             mirror = (*mirror, Notice("photo-curve", text))

@@ -91,8 +91,8 @@ def fit_screen(
     if fit.curved_file and ideal.saturated >= SCREEN_FIT.no_curve:
         fit.hidden = True
         ideal = fit.result(u)
-    if ideal.saturated >= SCREEN_FIT.no_curve and device == IDEAL:
-        fit.assume_falloff()
+    if printed is not None and ideal.saturated >= SCREEN_FIT.no_curve and device == IDEAL:
+        fit.assume_falloff()  # the paper will tell how much
     fit.free[:_COLOUR] = True
     fit.free[_GAMMA] = ideal.saturated < SCREEN_FIT.no_display
     if ideal.saturated >= SCREEN_FIT.no_curve:
@@ -742,8 +742,8 @@ class _Fit:
         """What each knot of a tone curve adds to the logarithm of the screen's light over the
         sample's, which is so much darker."""
         white = np.exp(u[_GAIN]).mean(keepdims=True) * self.reflectance.mean()
-        white = np.minimum(white, 1.0)  # the file's own, where the screen is brighter than that
-        return curve_shares(white)[0] - curve_shares(DISPLAY.sample * white)[0]
+        sample = np.minimum(DISPLAY.sample * white, DISPLAY.brightest_sample)
+        return curve_shares(white)[0] - curve_shares(sample)[0]
 
     def usual_deviation(self, span: Array) -> float:
         """That of cameras' curves about their mean, of what ``span`` adds up."""

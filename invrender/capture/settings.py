@@ -485,6 +485,7 @@ class Display:
     # Of the logarithm of the display's gamma; measured displays have gammas of 0.92 to 1.12.
     gamma_deviation: float = 0.06
     sample: float = 0.1  # of white, the radiance of a sample, about; by hand
+    brightest_sample: float = 0.3  # of a file's white, at most; by hand
     least_gain: float = 0.04  # of the cost, that further unknowns must explain; by hand
 
 
