@@ -24,6 +24,7 @@ from invrender.capture.near_lamp import find_near_lamp
 from invrender.capture.orientation import find_ball_and_orientation, not_the_pattern
 from invrender.capture.response import Response, curve_exponent
 from invrender.capture.screen import Screen, fit_screen
+from invrender.capture.screen_shade import place_lamps
 from invrender.capture.settings import (
     EXPOSURE,
     MIRRORED_TABLE,
@@ -133,6 +134,7 @@ def find_lights(
         unseen = sheet is None and found.camera_tilt is not None
         lights.fit["border_unseen"] = float(unseen)
         photo = without_ball_shade(photo.in_rec709(), lights, found)
+        lights = place_lamps(photo, lights)
         capture = replace(capture, photo=photo)
     if environment is not None:
         lights = replace(lights, environment=environment)

@@ -685,6 +685,29 @@ class BallShade:
     most_left: float = 0.9  # share of the photo's slopes, that is left
 
 
+@dataclass(frozen=True)
+class ScreenShade:
+    """The screen's shadow on the sample: `invrender.capture.screen_shade`; chosen by hand on three
+    photographs (docs/research-log/2026-11-30-the-edge-of-the-screens-shadow.md)."""
+
+    side: int = 64  # of the sample's square, where lamps throw it
+    coarse: int = 16  # the same, for other light
+    lamp: float = 1e-3  # share of the room's light, from which a texel is a lamp's
+    lamps: int = 3  # at most, the ones whose shadows are deepest
+    least: float = 0.1  # share of the light that a shadow takes
+    least_cosine: float = 0.05  # to the screen's normal
+    shift: float = 0.5  # texels that a lamp is off by, a standard deviation
+    width: float = 1.0  # of the logarithm of its width, likewise
+    narrower: float = -0.7  # that logarithm, where the search begins
+    reach: float = 1.0  # texels, by which the shadow is looked for beyond its place
+    steep: float = 0.1  # of its greatest slope, from which that counts
+    smooth: float = 0.7  # pixels, before slopes
+    step: float = 0.02  # of the search's differences
+    rounds: int = 25
+    better: float = 0.95  # cost over that of the lamp as it is
+    rows: int = 256  # of the environment with the narrower lamp
+
+
 DAMPED_STEPS = DampedSteps()
 BALL_VIEW = BallView()
 BALL_SEARCH = BallSearch()
@@ -713,3 +736,4 @@ NEAR_LAMP = NearLampSearch()
 HIDDEN_LAMP = HiddenLamp()
 CROP = Crop()
 BALL_SHADE = BallShade()
+SCREEN_SHADE = ScreenShade()
