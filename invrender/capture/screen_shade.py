@@ -38,6 +38,7 @@ def place_lamps(photo: Photo, lights: Lights) -> Lights:
     d, flux = sky_flux(lights.environment)
     power, half = flux.mean(-1), len(lights.environment) // 2
     lamps = connected((power > SCREEN_SHADE.lamp * power.sum()).reshape(half, -1))
+    lamps = [own for own in lamps if len(own) <= SCREEN_SHADE.texels]
     points = rig.sample_points(side, side).reshape(-1, 3)
     texel = np.pi / len(lights.environment)
     edges = [seen_past_edge(rig, points, d[own], texel) @ power[own] for own in lamps]
