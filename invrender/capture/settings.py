@@ -693,7 +693,7 @@ class ScreenShade:
     side: int = 64  # of the sample's square, where lamps throw it
     coarse: int = 16  # the same, for other light
     lamp: float = 1e-3  # share of the room's light, from which a texel is a lamp's
-    texels: int = 100  # of a lamp, at most: the shadows of wider ones have no edge
+    texels: int = 150  # of a lamp, at most: the shadows of wider ones have no edge
     lamps: int = 3  # at most, the ones whose shadows are deepest
     least: float = 0.1  # share of the light that a shadow takes
     least_cosine: float = 0.05  # to the screen's normal
