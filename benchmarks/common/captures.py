@@ -68,7 +68,7 @@ class CaptureSet:
 
 
 PHOTOGRAPHS = CaptureSet("holdout", 90_000)
-OTHERS = CaptureSet("families", 1_490_000, noise=(0.002, 0.02), later=223)
+OTHERS = CaptureSet("families", 1_730_000, noise=(0.002, 0.02), later=261)
 
 
 def make_captures(
