@@ -16,7 +16,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from scipy import ndimage, special
 from scipy.spatial.transform import Rotation
@@ -189,6 +188,8 @@ def _blur(image: Array, sigma: float) -> Array:
     It is smooth in sigma down to none, and its tails fall as a Gaussian's: beside a bright block a
     dark one has more of the neighbour's tail than of its own light.
     """
+    import cv2  # it takes 0.1 s, and a capture is loaded without it
+
     radius = int(4 * sigma) + 2
     kernel = np.diff(special.ndtr((np.arange(-radius, radius + 2) - 0.5) / sigma))
     kernel /= kernel.sum()
