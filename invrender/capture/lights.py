@@ -134,10 +134,11 @@ def find_lights(
         unseen = sheet is None and found.camera_tilt is not None
         lights.fit["border_unseen"] = float(unseen)
         photo = without_ball_shade(photo.in_rec709(), lights, found)
-        lights = place_lamps(photo, lights)
+        if environment is None:
+            lights = place_lamps(photo, lights)
         capture = replace(capture, photo=photo)
-    if environment is not None:
-        lights = replace(lights, environment=environment)
+    if environment is not None:  # nothing of it is a guess
+        lights = replace(lights, environment=environment, lamps=None)
     if gain is not None:
         lights = replace(lights, gain=_rgb(gain))
     notices = (

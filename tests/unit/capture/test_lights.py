@@ -7,6 +7,7 @@ from scipy import ndimage
 from synthetic_photo import blocks, grey_table, light_from, photograph, sky, textured_table
 
 from invrender.capture import ball as ball_module
+from invrender.capture import lights as lights_module
 from invrender.capture.ball import find_ball
 from invrender.capture.ball_image import trace_ball
 from invrender.capture.crop import crop_part, crop_sample
@@ -181,6 +182,22 @@ def test_no_ball_is_refused(table, monkeypatch):
     with pytest.raises(InputError, match="no mirror ball found"):
         find_ball(Photo(np.maximum(image + noise, 0).astype(np.float32)), RIG)
     assert len(fitted) <= 6
+
+
+def test_a_room_that_is_given_holds_no_guessed_lamps(clean, monkeypatch):
+    """Lamps of the ball's environment do not fit another one, in size or in place."""
+    measure = lights_module._measure
+
+    def with_lamps(*arguments):
+        lights, response = measure(*arguments)
+        return replace(lights, lamps=lights.environment / 2), response
+
+    monkeypatch.setattr(lights_module, "_measure", with_lamps)
+    room = np.full((8, 16, 3), 0.3, np.float32)
+    found = find_lights(Capture(Photo(clean), RIG, PATTERN), environment=room)
+    assert found.lights.lamps is None
+    twice = found.lights.scaled(np.ones(3), np.full(3, 2.0), np.full(3, 5.0))
+    np.testing.assert_allclose(twice.environment, 2 * room)
 
 
 def test_coins_are_no_balls():
