@@ -188,8 +188,8 @@ def test_a_room_that_is_given_holds_no_guessed_lamps(clean, monkeypatch):
     """Lamps of the ball's environment do not fit another one, in size or in place."""
     measure = lights_module._measure
 
-    def with_lamps(*arguments):
-        lights, response = measure(*arguments)
+    def with_lamps(*arguments, **known):
+        lights, response = measure(*arguments, **known)
         return replace(lights, lamps=lights.environment / 2), response
 
     monkeypatch.setattr(lights_module, "_measure", with_lamps)
